@@ -49,7 +49,8 @@ class LogCheck:
         measurements: the measurements, each with its verdict.
         runs, coordinates, inputs: tables of stretches, coordinates and inputs.
         delays: delay curve of each input.
-        steps: entries for ``steps`` of the data set in YAML: filter cutoff and delay, if needed.
+        steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
+        delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
         options: options of a training: heads for dry friction or servos, if needed; none if an
             angle turns too far in a sample for a step.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
@@ -64,6 +65,7 @@ class LogCheck:
     inputs: pd.DataFrame
     delays: list[logs.DelayCurve]
     steps: list[str]
+    delay: float | list[float] | None
     options: list[str]
     rigid: RigidExcitation | None = None
     motion: Averages | None = None
@@ -81,9 +83,11 @@ class LogCheck:
 
     @property
     def block(self) -> str:
-        """Entries for the YAML of the data set; without ``steps:`` if the data set has steps."""
-        head = [] if self.source.steps else ["steps:"]
-        return "\n".join([*head, *(f"  {line}" for line in self.steps)])
+        """Entries to append to the YAML of the data set, "" if there are none."""
+        head = ["steps:"] if self.steps and not self.source.steps else []
+        lines = [*head, *(f"  {line}" for line in self.steps)]
+        lines += [] if self.delay is None else [f"delay: {self.delay} # s"]
+        return "\n".join(lines)
 
     def table(self) -> pd.DataFrame:
         """Return one row per measurement, stops and warnings first."""
@@ -128,9 +132,8 @@ class LogCheck:
             lines += ["", title, text]
         ok = sum(x.verdict == "ok" for x in self.measurements)
         lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
-        if self.steps:
-            place = "steps" if self.source.steps else "the data set"
-            lines += ["", f"Append to {place}:", "", self.block]
+        if self.block:
+            lines += ["", "Append to the data set:", "", self.block]
         if self.options:
             lines += ["", f"Options of a training: model=lnn {' '.join(self.options)}"]
         return "\n".join(lines)
@@ -207,8 +210,8 @@ def check(
     for name, curve, lag in zip(source.u.columns, delays, clear, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
         text = (
-            f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the InputDelay step "
-            "below"
+            f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the delay below to "
+            "the data set"
         )
         measurements.append(_judged("delay [ms]", name, delay, "no clear delay", lag > 0, text))
     excitation = None
@@ -245,10 +248,8 @@ def check(
         coordinates,
         pd.DataFrame(table),
         delays,
-        [
-            *([] if sharp else _filter(source, training, step, noise, highest)),
-            *_delay(source, clear, step),
-        ],
+        [] if sharp else _filter(source, training, step, noise, highest),
+        _delay(source, clear),
         []
         if fast
         else ["model/input=servo", "model/integrator=rosenbrock"] * servo
@@ -329,12 +330,12 @@ def _filter(
     ]
 
 
-def _delay(source: logs.LogSource, delays: Sequence[float], step: float) -> list[str]:
-    shifts = [round(round(delay / step) * step, 9) for delay in delays]
-    value = shifts[0] if len(set(shifts)) == 1 else shifts
-    key = _key(source, "delay")
-    text = f"{key}: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s"
-    return [text] if any(shifts) else []
+def _delay(source: logs.LogSource, delays: Sequence[float]) -> float | list[float] | None:
+    """Return the delay of the data set with the measured delays added, rounded to 0.1 ms."""
+    if not any(delays):
+        return None
+    total = (np.resize(source.delay, len(delays)) + np.array(delays)).round(4).tolist()
+    return total[0] if len(set(total)) == 1 else total
 
 
 def _key(source: logs.LogSource, name: str) -> str:

@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pinn_dyn.data.logs import Butterworth, LogSource, Recording
+from pinn_dyn.data.logs import Butterworth, LogSource, MovingAverage, Recording
 from pinn_dyn.data.logs.averages import white_noise
 from pinn_dyn.evaluation.log_check import check
 from pinn_dyn.evaluation.log_numbers import bandwidth
@@ -75,8 +75,9 @@ def test_a_delay_is_measured_warned_of_and_given_as_a_step():
     result = checked(driven(delay=0.05, noise=1e-5))
     assert [x.delay for x in result.delays] == pytest.approx([0.05, 0.05], abs=0.006)
     assert verdicts(result)["delay [ms]", "u1"] == "warning"
-    (line,) = result.steps
-    assert line.startswith("delay: {_target_: pinn_dyn.data.logs.InputDelay, delay: 0.05}")
+    assert result.delay == pytest.approx(0.05, abs=0.006)
+    again = checked(driven(delay=0.05, noise=1e-5), delay=result.delay)
+    assert again.delay is None
 
 
 @pytest.mark.parametrize("late", [0, 3])
@@ -87,9 +88,8 @@ def test_joints_that_rest_in_turn_get_their_friction_and_no_false_delay(dry, lat
     columns |= {f"u{k + 1}": item.u[:, k] for k in range(2)}
     result = checked(pd.DataFrame(columns))
     # A held torque acts half a sample of 5 ms later.
-    lines = [x for x in result.steps if "InputDelay" in x]
-    assert len(lines) == (late > 0)
-    assert all("delay: 0.015}" in x or "delay: 0.02}" in x for x in lines)
+    assert (result.delay is not None) == (late > 0)
+    assert np.resize(result.delay or 0.0175, 2) == pytest.approx([0.0175] * 2, abs=0.003)
     assert result.options == (["model/friction=coulomb"] if dry else [])
     shares = result.inputs["dry friction"].to_numpy()
     assert shares == pytest.approx(dry / item.u.std(axis=0), abs=0.03)
@@ -109,15 +109,14 @@ def test_no_filter_smears_dry_friction_where_v_is_measured():
         assert any(x.startswith("filter") for x in result.steps) == (v is None)
 
 
-def test_the_block_to_copy_extends_the_steps_of_the_data_set():
-    frame = driven(delay=0.05, noise=1e-5)
-    for steps in ({}, {"delay": Butterworth(20.0)}):
+def test_the_block_to_copy_extends_the_data_set():
+    frame = driven(delay=0.05, noise=0.005)
+    for steps in ({}, {"first": MovingAverage(3)}):
         result = checked(frame, steps=steps)
-        text = "name: masses\n" + ("steps:\n  delay: {cutoff: 20.0}\n" if steps else "")
-        entries = yaml.safe_load(text + result.block)["steps"]
-        (added,) = [x for x in entries.values() if "_target_" in x]
-        assert added == {"_target_": "pinn_dyn.data.logs.InputDelay", "delay": 0.05}
-        assert len(entries) == len(steps) + 1
+        text = "name: masses\n" + ("steps:\n  first: {window: 3}\n" if steps else "")
+        entries = yaml.safe_load(f"{text}{result.block}\n")
+        assert entries["delay"] == result.delay
+        assert len(entries.get("steps", {})) == 1
 
 
 def test_noise_is_measured_and_gives_a_filter_above_the_motion():
@@ -188,7 +187,7 @@ def test_targets_of_servos_are_told_from_forces(settings):
     result = checked(servo_arm(**settings), **signals)
     # Servos with light joints are stiff: RK4 diverges at the usual sample times.
     assert {"model/input=servo", "model/integrator=rosenbrock"} <= set(result.options)
-    assert not any("InputDelay" in line for line in result.steps)
+    assert result.delay is None
     assert not [text for text in result.warnings if "acts" in text]
     torques = signals | {"u": dict(columns=["u1", "u2"], unit="Nm")}
     assert "model/input=servo" not in checked(servo_arm(**settings), **torques).options

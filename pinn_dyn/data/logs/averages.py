@@ -46,6 +46,7 @@ class Averages:
         u: M inputs at each of D lags, ``(R, D, M)``.
         block: block of the row, ``(R,)``: :data:`PARTS` for each run.
         noise: part of the variance of a that is noise, ``(N,)``.
+        spread: standard deviation of the inputs before averaging, ``(M,)``.
     """
 
     t: np.ndarray
@@ -58,6 +59,7 @@ class Averages:
     u: np.ndarray
     block: np.ndarray
     noise: np.ndarray
+    spread: np.ndarray
 
     @classmethod
     def of(
@@ -102,7 +104,8 @@ class Averages:
         t, q, v, a, sign, slow_sign, still, u = columns
         white = np.max([noise(item.q) for item in recordings], axis=0) / step**2
         share = _SECOND / samples**5 * white**2 / a.var(axis=0).clip(min=1e-300)
-        return cls(t, q, v, a, sign, slow_sign, still < _RESTING, u, block, share)
+        spread = np.concatenate([item.u for item in recordings]).std(axis=0).clip(min=1e-300)
+        return cls(t, q, v, a, sign, slow_sign, still < _RESTING, u, block, share, spread)
 
     def rows(self, mask: np.ndarray) -> Averages:
         """Return the averages at some rows."""

@@ -210,7 +210,7 @@ def _input_curve(
     # The level of the friction is that without its rise at low speed.
     level = regression.fit("u", ["terms", "sign"], weights).theta[:, columns["terms"].shape[1] :]
     own = i if columns["sign"].shape[1] > 1 else 0
-    friction = level[:, own] / u.std(axis=0) if inputs == data.q.shape[1] else np.nan * shares
+    friction = level[:, own] / data.spread[i] if inputs == data.q.shape[1] else np.nan * shares
     return _curve(candidates, shares, friction, form)
 
 

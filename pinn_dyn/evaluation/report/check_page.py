@@ -40,8 +40,8 @@ def check_report(check: LogCheck, *, command: str) -> str:
         text = "measured forces, the part that the equation of motion explains, and the residual"
         verdict += [paragraph(_FORCES), drawing(_forces(check), text)]
     verdict += [paragraph(text) for text in check.findings()]
-    if check.steps:
-        text = "Steps that follow from the measured delay and noise, to append to the data set:"
+    if check.block:
+        text = "Entries that follow from the measured delay and noise, to append to the data set:"
         verdict += [paragraph(text), preformatted(check.block)]
     if check.options:
         verdict.append(paragraph(f"Options of a training: model=lnn {' '.join(check.options)}"))
