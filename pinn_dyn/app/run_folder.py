@@ -244,11 +244,11 @@ def claimed(
         with FileLock(folder / ".lock", timeout=0):
             for partial in folder.rglob("*.partial"):  # of a process that was killed while writing
                 partial.unlink(missing_ok=True)
-            for path in [folder / name for name in _RESULTS if overwrite]:
-                if path.is_dir():
-                    shutil.rmtree(path)
+            for result in [folder / name for name in _RESULTS if overwrite]:
+                if result.is_dir():
+                    shutil.rmtree(result)
                 else:
-                    path.unlink(missing_ok=True)
+                    result.unlink(missing_ok=True)
             path, saved = newest_checkpoint(folder)
             if saved:
                 _require_same_config(folder, saved["hyper_parameters"]["config"], config)

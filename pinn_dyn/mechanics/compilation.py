@@ -202,7 +202,7 @@ def _keep_rows() -> None:
     lowering.add_layout_constraint(solve, lowering.constrain_to_fx_strides)
 
 
-_OPTIONS = {"cpp.threads": 1, "cpp_wrapper": True}
+_OPTIONS: dict[str, Any] = {"cpp.threads": 1, "cpp_wrapper": True}
 _OPTIONS |= {"post_grad_fusion_options": {"decompose_mm_pass": {}}}
 # One block of memory per call instead of a hundred, which take 8 % of a step at N = 3.
 _PLANNED = {"memory_planning": True, "memory_pool": "intermediates"}
