@@ -264,7 +264,7 @@ def train(
                     _start_from(start_from, learner, new=checkpoint is None)
                 _fit(loop, learner, windows, identity, checkpoint, run_folder)
     except KeyboardInterrupt:
-        way = f"the same call resumes it from {run_folder}"
+        way = f"the same call resumes it from {run_folder}" + " without overwrite" * overwrite
         if temporary is not None:
             way = "its steps are lost; with folder=... the same call would resume it"
         elif not (run_folder / CHECKPOINTS / "last.ckpt").is_file():
