@@ -25,6 +25,7 @@ from pinn_dyn.spelling import did_you_mean
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
+_RUNS = {"evaluate": "runs=[{}]", "gather": "runs=[{}]", "control": "run={}"}
 CONFIG = "config.yaml"  # in the folder of a run
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
@@ -44,8 +45,15 @@ def config_folder(command: str) -> Path:
 
 
 def completed(command: str, overrides: Sequence[str]) -> list[str]:
-    """Put ``++`` before every override of a value, so that keys in no YAML can be set as well."""
+    """Put ``++`` before every override of a value, so that keys in no YAML can be set as well.
+
+    Words without ``=`` are paths of run folders: they become the value of ``runs`` or ``run``.
+    """
     folder = config_folder(command)
+    paths = [text for text in overrides if "=" not in text and not text.startswith("~")]
+    if paths and command in _RUNS:
+        text = ",".join(f"'{path}'" for path in paths)
+        overrides = [x for x in overrides if x not in paths] + [_RUNS[command].format(text)]
     matches = [re.match(r"(?!hydra\.)([A-Za-z]\w*(?:\.\w+)*)=", text) for text in overrides]
     return [
         f"++{text}" if match and not (folder / match[1]).is_dir() else text

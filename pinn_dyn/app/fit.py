@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from pydantic import PositiveInt
 
 from pinn_dyn.app.run import ModelBuilder, Run
-from pinn_dyn.app.trainer import even_validations
-from pinn_dyn.app.training import MODELS, train
-from pinn_dyn.data import DynamicsData, LogSource
+from pinn_dyn.app.training import train
+from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs.step import Step
-from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.training import LeastSquares
 
 Signals = str | Sequence[str] | Mapping[str, Any]
 
-STEPS = 1000
-"""Default steps of the optimizer."""
-_PAIRS, _BATCH = 10_000, 128  # at most
-_WINDOW, _STEP = 2, 0.02  # steps of a training window, and their length in s
-_FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs for least squares, and steps for it and subnet
-_HISTORY = 0.5  # s of the past, for subnet
-_HORIZON = 2.0  # s, at most, of the rollouts that choose the best checkpoint
 _SI = {"time": "s", "v": "1/s", "q": "1", "u": "1"}
 
 
 def fit(
-    frame: pd.DataFrame,
+    frame: pd.DataFrame | str | Path | Sequence[Any] | Mapping[str, Any],
     *,
     q: Signals,
     u: Signals | None,
@@ -40,18 +30,19 @@ def fit(
     run: str | None = None,
     model: str | ModelBuilder | Predictor = "lnn",
     cleaning: Mapping[str, Step] | None = None,
-    steps: PositiveInt = STEPS,
+    steps: PositiveInt | None = None,
     seed: int = 0,
     **options: Any,
 ) -> Run:
-    """Train a model on a data frame with one row per sample, and return the run.
+    """Train a model on a log with one row per sample, and return the run.
 
-    The frame is read, checked, split and cleaned like a log file, see
+    The log is read, checked, split and cleaned, see
     :class:`~pinn_dyn.data.logs.LogSource`; 15 % are for validation and 15 % for the test. For
     other splits, call :func:`~pinn_dyn.train` on a ``LogSource``.
 
     Args:
-        frame: the log.
+        frame: the log as a data frame; as data frames of its runs, in a list or by name; as a
+            mapping from the names of columns to values; or as paths of files.
         q, u, v: columns of the configuration, the input and, if measured, the velocity: names in
             SI units, or ``{"columns": [...], "unit": "deg"}`` and other arguments of
             :class:`~pinn_dyn.data.logs.Columns`.
@@ -60,11 +51,12 @@ def fit(
         run: column that tells runs apart; None if all rows are one run.
         model: as in :func:`~pinn_dyn.train`.
         cleaning: names and steps of the cleaning, in order.
-        steps: steps of the optimizer.
+        steps: steps of the optimizer, 1,000 by default.
         seed: seed of the weights, the batches and the choice of runs.
         options: other arguments of :func:`~pinn_dyn.train`, such as ``folder="runs/arm"``.
 
     Raises:
+        TypeError: if the log is an array, whose columns have no names.
         ValueError: if columns, units, clocks or settings cannot be used; names them.
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
@@ -73,32 +65,24 @@ def fit(
         name: {"columns": value, "unit": _SI[name]} if isinstance(value, (str, Sequence)) else value
         for name, value in signals.items()
     }
-    source = LogSource(
-        name="frame", files=frame, trajectory=run, steps=cleaning, seed=seed, **columns
-    )
-    splits = source.load()
-    t = splits.train[0].t
-    stride = max(round(_STEP / float(t[1] - t[0])), 1)
-    constants = isinstance(options.get("optimizer"), LeastSquares)
-    pairs, window = (_FEW_PAIRS, _LONG_WINDOW) if constants else (_PAIRS, _WINDOW)
-    windows = partial(
-        DynamicsData, pairs=pairs, steps=window, stride=stride, batch_size=min(_BATCH, pairs)
-    )
-    horizon = min(_HORIZON, *(item.duration for item in splits.validation))
-    if model == "subnet":
-        windows = partial(windows, history=_HISTORY, steps=_LONG_WINDOW)
-    if model == "hnn":  # a log has no momenta
-        options = {"model_name": "hnn", **options}
-        model = partial(MODELS["hnn"], state="qv")
-    return train(
-        source,
-        model,
-        steps=steps,
-        seed=seed,
-        **{
-            "data": windows,
-            "validator": partial(RolloutValidator, horizon=horizon),
-            "validations": even_validations(steps, 10),
-            **options,
-        },
+    files = _files(frame)
+    source = LogSource(files=files, trajectory=run, steps=cleaning, seed=seed, **columns)
+    return train(source, model, steps=steps, seed=seed, **options)
+
+
+def _files(log: Any) -> Any:
+    """Return a data frame, data frames by the names of their runs, or paths of files."""
+    items = list(log.values()) if isinstance(log, Mapping) else log
+    items = [items] if isinstance(items, str | Path | pd.DataFrame) else items
+    are_frames = isinstance(items, Sequence) and all(isinstance(x, pd.DataFrame) for x in items)
+    if isinstance(log, Mapping) and not are_frames:
+        return pd.DataFrame(log)
+    if are_frames:
+        return log if not isinstance(log, Sequence) else {f"run_{k}": x for k, x in enumerate(log)}
+    if isinstance(items, Sequence) and all(isinstance(x, str | Path) for x in items):
+        return [str(path) for path in items]
+    raise TypeError(
+        f"the log is a {type(log).__name__}, expected a data frame, data frames in a list or dict, "
+        "a dict of columns, or paths of files: name the columns of an array, as in "
+        "pandas.DataFrame(array, columns=['t', 'q1', 'u1'])"
     )

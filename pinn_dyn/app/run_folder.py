@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import pkgutil
+import shutil
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -32,6 +33,10 @@ from pinn_dyn.training import COVARIANCE, WholeCheckpoints
 METRICS, CHECKPOINTS = "metrics.json", "checkpoints"
 RECORD, DATA, FINISHED = "record", "data", "finished"
 """Keys of a checkpoint: metrics of the training, identity of the data, end of the training."""
+_MOVED = "examples.cleaning_steps."
+REPLACE = "train into another folder, or replace the run by overwrite=True"
+_RESULTS = (CHECKPOINTS, "tensorboard", METRICS, "constants.csv", "undetermined.md", "payload.csv")
+"""Files and folders that only some trainings write."""
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +137,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             if damaged := archive.testzip():  # torch.load does not compare the checksums
                 raise zipfile.BadZipFile(f"{damaged} has another checksum")
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        config = saved["hyper_parameters"]["config"]
+        config = _renamed(saved["hyper_parameters"]["config"])
+        saved["hyper_parameters"]["config"] = config
         config.setdefault("ensemble", 1)
         config["dataset"].pop("cache", None)  # each user has their own
         config["model"] = _without_delay(config["model"])
@@ -148,6 +154,16 @@ def _without_delay(part: Any) -> Any:
     if not isinstance(part, Mapping):
         return part
     return {key: _without_delay(x) for key, x in part.items() if (key, x) != ("delay", None)}
+
+
+def _renamed(part: Any) -> Any:
+    """Replace the paths of classes that have moved since the run was made."""
+    if isinstance(part, list):
+        return [_renamed(item) for item in part]
+    if isinstance(part, Mapping):
+        return {key: _renamed(value) for key, value in part.items()}
+    is_moved = isinstance(part, str) and part.startswith(_MOVED)
+    return part.replace(_MOVED, "pinn_dyn.data.logs.") if is_moved else part
 
 
 def newest_checkpoint(folder: Path) -> tuple[Path | None, dict[str, Any]]:
@@ -172,12 +188,12 @@ def finish(folder: Path, record: dict[str, Any]) -> None:
 
 
 def require_same_data(
-    folder: Path, before: Mapping[str, Any], name: str, now: Mapping[str, Any]
+    folder: Path, before: Mapping[str, Any], name: str, now: Mapping[str, Any], advice: str = ""
 ) -> None:
     """Refuse data that have changed since a training: test motions may have moved."""
     if changes := data_changes(before, now) if before else []:
         more = [f"and {len(changes) - 10} more"] if len(changes) > 10 else []
-        text = "\n  ".join([*changes[:10], *more])
+        text = "\n  ".join([*changes[:10], *more, *filter(None, [advice])])
         raise ConfigError(f"{name} has changed since {folder} was trained:\n  {text}")
 
 
@@ -215,16 +231,24 @@ def require_no_links_out(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def claimed(folder: Path, config: dict[str, Any]) -> Iterator[tuple[Path | None, dict[str, Any]]]:
+def claimed(
+    folder: Path, config: dict[str, Any], overwrite: bool = False
+) -> Iterator[tuple[Path | None, dict[str, Any]]]:
     """Lock a run folder for a configuration; yield path and content of its newest checkpoint.
 
-    Refuse a folder that another process locks, or with a training of another configuration.
+    Refuse a folder that another process locks, or with a training of another configuration, which
+    ``overwrite`` deletes.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(folder / ".lock", timeout=0):
             for partial in folder.rglob("*.partial"):  # of a process that was killed while writing
                 partial.unlink(missing_ok=True)
+            for result in [folder / name for name in _RESULTS if overwrite]:
+                if result.is_dir():
+                    shutil.rmtree(result)
+                else:
+                    result.unlink(missing_ok=True)
             path, saved = newest_checkpoint(folder)
             if saved:
                 _require_same_config(folder, saved["hyper_parameters"]["config"], config)
@@ -247,7 +271,7 @@ def _require_same_config(folder: Path, before: dict[str, Any], now: dict[str, An
     ]
     if differences:
         text = ", ".join(differences[:5])
-        raise ConfigError(f"{folder} holds a training of another configuration: {text}")
+        raise ConfigError(f"{folder} holds a training of another configuration: {text}: {REPLACE}")
 
 
 def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

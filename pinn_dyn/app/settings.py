@@ -42,6 +42,7 @@ class TrainSettings:
     start_from: str | None = None
     payload: Names | None = None
     resume: str | None = None
+    overwrite: bool = False
     trust: Names | None = None
     dataset: DataSource
     data: DynamicsData | Callable[..., DynamicsData]

@@ -48,15 +48,18 @@ def train(cfg: DictConfig) -> float:
         check_name("model_name", config["model_name"])  # files are named by it
         check_name("dataset.name", config["dataset"].get("name", "data"))
     start, payload = config.get("start_from"), config.pop("payload", None)
+    overwrite = config.pop("overwrite", False)
     try:
         run = training.train(
             **training_arguments(config, folder),
             start_from=None if start is None else load_run(Path(start), "best", trust),
             folder=folder,
+            overwrite=overwrite,
             config=config,
         )
     except KeyboardInterrupt as interrupt:
-        if not isinstance(stop := interrupt.__cause__, SystemExit):
+        stop = interrupt.__context__ and interrupt.__context__.__cause__
+        if not isinstance(stop, SystemExit):
             raise
         job, way = HydraConfig.get(), f"resume with: {resume_command(folder)}"
         if not (folder / CHECKPOINTS / "last.ckpt").is_file():

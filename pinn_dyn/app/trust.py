@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import pkgutil
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from pinn_dyn.app.validation import ConfigError, places
@@ -93,17 +91,7 @@ def may_build(target: Any, trust: tuple[str, ...]) -> bool:
         value = getattr(module, name, None) if name in module.__all__ else None
         if isinstance(value, type) and value.__module__.startswith("pinn_dyn."):
             return True
-    if package == "examples.cleaning_steps" and _has_own_examples():
-        value = getattr(importlib.import_module(package), name, None)
-        return isinstance(value, type) and value.__module__ == package
     return str(target) in _ALLOWED or is_trusted(target, trust)
-
-
-def _has_own_examples() -> bool:
-    spec = importlib.util.find_spec("examples")  # does not import it
-    folders = [] if spec is None else list(spec.submodule_search_locations or [])
-    beside = Path(__file__).resolve().parents[2] / "examples"
-    return {Path(folder).resolve() for folder in folders} == {beside}
 
 
 def is_trusted(target: Any, trust: tuple[str, ...]) -> bool:

@@ -20,6 +20,7 @@ from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, sam
 from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
+_HORIZON = 2.0  # s, of long trajectories
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
 _LARGEST_RATIO = 10.0
 _LAGS = 8  # in a window, at which the motion of the training is measured
@@ -40,7 +41,8 @@ class RolloutValidator:
     to whole steps.
 
     Args:
-        horizon: length of the trajectories, s.
+        horizon: length of the rollouts, s; None takes 2 s, or the shortest trajectory if that is
+            shorter.
         window: time between two resets to the measured state, s; open loop if None.
         step: step of the rollouts, s; None takes that of the training windows.
         training_step: step of the training windows, s.
@@ -52,18 +54,19 @@ class RolloutValidator:
     def __init__(
         self,
         *,
-        horizon: PositiveFloat = 2.0,
+        horizon: PositiveFloat | None = None,
         step: PositiveFloat | None = None,
         training_step: PositiveFloat,
         window: PositiveFloat | None = None,
     ):
-        self.horizon = horizon
+        self._shortens = horizon is None
+        self.horizon = horizon or _HORIZON
         self.window = window
         self.step = training_step if step is None else step
         self._training: Sequence[Trajectory] = ()
-        if not self.step <= (horizon if window is None else window) <= horizon:
+        if not self.step <= (window or self.horizon) <= self.horizon:
             raise ValueError(
-                f"window is {window} s, step {self.step} s and horizon {horizon} s, "
+                f"window is {window} s, step {self.step} s and horizon {self.horizon} s, "
                 "expected step <= window <= horizon"
             )
 
@@ -75,6 +78,8 @@ class RolloutValidator:
     def check(self, truth: Trajectory, training: Sequence[Trajectory] = ()) -> None:
         """Raise ValueError for data that do not fit horizon, window and step; keep the training."""
         self._training = training
+        if self._shortens:
+            self.horizon = min(self.horizon, truth.duration)
         samples_of_window(self.window, self.step, truth.until(self.horizon).t)
 
     def predict(self, model: Predictor, truth: Trajectory) -> Prediction:

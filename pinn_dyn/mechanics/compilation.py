@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import logging
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,8 +32,14 @@ MOST_EVALUATIONS = 4
 CHUNK = 256
 """Number of windows with MOST_EVALUATIONS that are computed at once, so that the values for the
 gradient stay in the cache. Batches of less than twice this number are not split."""
+LARGEST_PLANNED = 7_000
+"""Largest number of operations of a program whose memory is planned, an experimental option of the
+compiler: an RK4 step with gradients has 6,500 at N = 3. The recursion is too deep at N = 7."""
 _SHORT = 8
 """Largest number of terms for which the compiler can fuse a product as a sum."""
+
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -150,7 +158,12 @@ def compile_graph(
         program = compile_fx_graph(graph, list(arguments), {"combo_kernels": True})
         return _Recorded(program, arguments)
     # Without the wrappers of torch.compile, which take 0.15 ms per call.
-    return compile_fx_graph(graph, list(arguments), {"cpp.threads": 1, **_OPTIONS})
+    if len(graph.graph.nodes) <= LARGEST_PLANNED:
+        try:
+            return compile_fx_graph(copy.deepcopy(graph), list(arguments), _OPTIONS | _PLANNED)
+        except Exception as error:
+            log.info("compiling again without an experimental option: %s", type(error).__name__)
+    return compile_fx_graph(graph, list(arguments), _OPTIONS)
 
 
 def _share_constants(graph: GraphModule) -> None:
@@ -189,9 +202,10 @@ def _keep_rows() -> None:
     lowering.add_layout_constraint(solve, lowering.constrain_to_fx_strides)
 
 
-_OPTIONS = {"cpp_wrapper": True, "post_grad_fusion_options": {"decompose_mm_pass": {}}}
+_OPTIONS: dict[str, Any] = {"cpp.threads": 1, "cpp_wrapper": True}
+_OPTIONS |= {"post_grad_fusion_options": {"decompose_mm_pass": {}}}
 # One block of memory per call instead of a hundred, which take 8 % of a step at N = 3.
-_OPTIONS |= {"memory_planning": True, "memory_pool": "intermediates"}
+_PLANNED = {"memory_planning": True, "memory_pool": "intermediates"}
 
 
 def _mm(a: Tensor, b: Tensor) -> Tensor:

@@ -2,11 +2,14 @@
 
 import inspect
 import itertools
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 
+import lightning as L
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,6 +19,8 @@ from scipy.signal import savgol_filter
 import pinn_dyn
 from pinn_dyn.app.build import training_arguments
 from pinn_dyn.app.config import composed
+from pinn_dyn.app.training import STEPS
+from pinn_dyn.app.training import _windows as default_windows
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.data.logs import InputDelay, MovingAverage
 from pinn_dyn.evaluation import RolloutValidator
@@ -52,10 +57,14 @@ class Still(pinn_dyn.DataSource):
 
     name, labels, input_labels = "still", ["q [m]"], ["u [N]"]
 
+    def __init__(self, speed=1.0):
+        self.speed = speed
+
     def load(self):
         t = torch.arange(21, dtype=torch.float64) * 0.01
         q, u = (t**2 / 2).unsqueeze(1), torch.ones(21, 1).double()
-        motion = pinn_dyn.Trajectory(q, t.unsqueeze(1), pinn_dyn.Signal(t, u))
+        v = self.speed * t.unsqueeze(1)
+        motion = pinn_dyn.Trajectory(q, v, pinn_dyn.Signal(t, u))
         return pinn_dyn.Splits([motion], [motion], [motion])
 
 
@@ -204,9 +213,11 @@ def test_train_has_the_defaults_of_the_command_line():
         name: parameter.default
         for name, parameter in inspect.signature(pinn_dyn.train).parameters.items()
     }
-    for name in ("steps", "seed", "ensemble", "compile", "threads"):
+    for name in ("seed", "ensemble", "compile", "threads"):
         assert built[name] == defaults[name]
+    assert built["steps"] == STEPS
     assert built["validations"] == 4
+    defaults["data"] = default_windows(Still(), "hnn", defaults["optimizer"])
     assert built["trainer"] == defaults["trainer"]
 
     def arguments(builder):
@@ -369,6 +380,7 @@ def test_a_built_model_is_trained_and_loaded_by_a_builder(tmp_path):
         ),
         ({"model": "known"}, "model is .known., expected lnn, .* or a builder"),
         ({"model": "subent"}, "model is .subent.: did you mean subnet"),
+        ({"loss": "incremnt"}, "loss is .incremnt.: did you mean increment"),
     ],
 )
 def test_what_cannot_be_fitted_is_named(changes, message):
@@ -376,10 +388,93 @@ def test_what_cannot_be_fitted_is_named(changes, message):
         fit(**changes)
 
 
-def test_a_folder_of_another_training_is_refused(tmp_path):
-    pinn_dyn.train(Still(), "acceleration", folder=tmp_path, **SHORT)
-    with pytest.raises(ValueError, match=r"another configuration: seed=1 \(there 0\)"):
-        pinn_dyn.train(Still(), "acceleration", folder=tmp_path, seed=1, **SHORT)
+def test_a_finished_run_is_loaded_only_for_the_same_data_and_arguments(tmp_path):
+    """Otherwise the message names the difference, and its advice trains anew."""
+
+    def trained(speed=1.0, **changes):
+        return pinn_dyn.train(Still(speed), "acceleration", folder=tmp_path, **SHORT | changes)
+
+    first = trained()
+    (tmp_path / "constants.csv").touch()
+    (tmp_path / "note.txt").touch()
+    assert trained().metrics == first.metrics
+    with pytest.raises(ValueError, match=r"seed=1 \(there 0\): train into another folder") as error:
+        trained(seed=1)
+    with pytest.raises(ValueError, match=r"(?s)still has changed .*train has other") as error:
+        trained(2.0)
+    assert pinn_dyn.load(tmp_path).source.load().train[0].v[1] == pytest.approx(0.01)
+    advice = re.search(r"by (\w+)=True", str(error.value))[1]
+    second = trained(2.0, **{advice: True})
+    assert second.statistics.v_std > 1.5 * first.statistics.v_std
+    assert not (tmp_path / "constants.csv").exists()
+    assert (tmp_path / "note.txt").exists()  # of the user
+    assert trained(2.0).metrics == second.metrics
+
+
+def test_a_built_model_is_loaded_only_with_the_same_constants(tmp_path):
+    """Its learned parameters may differ: a training changes them."""
+    windows = DynamicsData(Still(), pairs=8, batch_size=8, stride=1, batches_per_epoch=1, seed=0)
+    built = AccelerationMLP(windows.statistics, hidden=[4])
+    first = pinn_dyn.train(Still(), built, folder=tmp_path, **SHORT)
+    assert pinn_dyn.train(Still(), built, folder=tmp_path, **SHORT).metrics == first.metrics
+    other = AccelerationMLP(replace(windows.statistics, v_std=torch.ones(1)), hidden=[4])
+    with pytest.raises(ValueError, match=r"another configuration: built="):
+        pinn_dyn.train(Still(), other, folder=tmp_path, **SHORT)
+
+
+def test_train_and_fit_have_one_set_of_defaults():
+    """Also on a log whose pieces are shorter than the usual horizon."""
+    frame = log()
+    fitted = pinn_dyn.fit(frame, q=Q, u=U, run="run", steps=1)
+    source = pinn_dyn.LogSource(files=frame, time="t", q=Q, u=U, trajectory="run")
+    for model in ("lnn", "hnn", "subnet"):
+        trained = pinn_dyn.train(source, model, steps=1)
+        assert trained.config["data"]["steps"] == (10 if model == "subnet" else 2)
+        if model == "lnn":
+            assert trained.metrics["validation"] == fitted.metrics["validation"]
+            for key in ("data", "validator", "optimizer", "loss", "trainer", "log"):
+                assert trained.config[key] == fitted.config[key]
+
+
+@pytest.mark.parametrize("kind", ["dict", "list", "columns", "path"])
+def test_a_log_is_fitted_in_every_form(monkeypatch, tmp_path, kind):
+    frame, sources = log().reset_index(drop=True), []
+    runs = {name: rows for name, rows in frame.groupby("run")}
+    frame.to_csv(tmp_path / "my arm.csv", index=False)
+    forms = {"dict": runs, "list": list(runs.values()), "path": tmp_path / "my arm.csv"}
+    forms["columns"] = {name: frame[name].to_numpy() for name in frame}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pinn_dyn.app.fit.train", lambda source, *_, **__: sources.append(source))
+    column = "run" if kind in ("columns", "path") else None
+    path = "my arm.csv" if kind == "path" else forms[kind]
+    for form, run in ((frame, "run"), (path, column)):
+        pinn_dyn.fit(form, q=Q, u=U, run=run)
+    first, second = (source.load() for source in sources)
+    assert sources[1].name == ("myarm" if kind == "path" else "frame")
+    assert len(first.train) == len(second.train)
+    for a, b in zip(first.train, second.train, strict=True):
+        torch.testing.assert_close(a.q, b.q, atol=1e-9, rtol=0)
+
+
+def test_an_array_without_names_is_refused_with_a_call_that_works():
+    with pytest.raises(TypeError, match=r"the log is a ndarray, expected a data frame") as error:
+        pinn_dyn.fit(np.zeros((9, 3)), q="q1", u="u1")
+    call = re.search(r"as in (pandas\..*)", str(error.value))[1]
+    assert list(eval(call, {"pandas": pd, "array": np.zeros((9, 3))})) == ["t", "q1", "u1"]
+
+
+def test_an_interrupted_training_ends_with_one_line(tmp_path):
+    """The innermost frame is that of train: none of Lightning."""
+
+    class Interrupt(L.Callback):
+        def on_train_batch_start(self, *_):
+            raise KeyboardInterrupt
+
+    for folder, text in ((tmp_path, "starts again"), (None, "folder=.* resume")):
+        with pytest.raises(KeyboardInterrupt, match=text) as error:
+            pinn_dyn.train(Still(), "lnn", folder=folder, **SHORT | {"callbacks": [Interrupt()]})
+        assert error.traceback[-1].name == "train"
+        assert error.value.__suppress_context__
 
 
 def test_a_model_with_a_memory_trains_on_windows_with_a_past(caplog):

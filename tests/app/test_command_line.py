@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from pinn_dyn.app.command import COMMANDS, main
+from pinn_dyn.app.config import completed, composed
 from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, run_script
 
 
@@ -53,6 +54,23 @@ def test_a_misspelt_key_is_answered_with_the_right_one(elsewhere, script, mistak
     assert "did you mean" in str(error)
     assert re.search(rf"[ ]{re.escape(meant)}[ ?]", str(error).split("did you mean")[1])
     assert not list(elsewhere.iterdir())
+
+
+def test_paths_of_run_folders_need_no_key(elsewhere):
+    """What everyone types first, and what a shell makes of runs/*."""
+    paths = ["runs/a", "runs/it has, commas"]
+    assert composed("evaluate", ["horizon=1", *paths])["runs"] == paths
+    assert completed("control", ["runs/a"]) == ["++run='runs/a'"]
+    assert "'runs/a' matches no run folder" in str(fails("evaluate.py", "runs/a"))
+
+
+def test_a_data_set_without_a_name_has_that_of_its_file(elsewhere):
+    (elsewhere / "conf" / "dataset").mkdir(parents=True)
+    log = "files: a.csv\nq: {columns: q, unit: rad}\nu: []\nvalidation: null\ntest: null\n"
+    text = f"defaults: [csv_log, _self_]\n{log}"
+    (elsewhere / "conf" / "dataset" / "my_arm.yaml").write_text(text)
+    config = composed("train", ["dataset=my_arm"], str(elsewhere / "conf"))
+    assert config["dataset"]["name"] == "my_arm"
 
 
 def test_a_misspelt_key_in_a_sweep_is_answered_before_any_run(elsewhere):

@@ -5,10 +5,9 @@ import pandas as pd
 import pytest
 import torch
 
-from examples.cleaning_steps import SubtractStart
 from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import LogSource
-from pinn_dyn.data.logs import Deduplicate, InputDelay, InputRates, Resample
+from pinn_dyn.data.logs import Deduplicate, InputDelay, InputRates, Resample, SubtractStart
 from tests.support.linear import unit_masses
 
 

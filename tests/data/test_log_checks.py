@@ -8,12 +8,12 @@ import pytest
 import yaml
 from hydra.utils import instantiate
 
-from examples.cleaning_steps import RowClock
 from pinn_dyn.data.logs import (
     Deduplicate,
     LogError,
     RemoveJumps,
     Resample,
+    RowClock,
     SplitGaps,
 )
 from pinn_dyn.data.logs.checks import _are_ticks

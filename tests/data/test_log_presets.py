@@ -131,7 +131,7 @@ def test_run_folders_may_name_the_steps_of_this_checkout_only(tmp_path):
     (tmp_path / "examples").mkdir()
     (tmp_path / "examples" / "__init__.py").write_text("open('was_here', 'w')")
     code = "from pinn_dyn.app.trust import may_build as may; print(may({!r}, ()))"
-    name = "examples.cleaning_steps.{}"
+    name = "pinn_dyn.data.logs.{}"
     result = subprocess.run(
         [sys.executable, "-c", code.format(name.format("SubtractStart"))],
         cwd=tmp_path,

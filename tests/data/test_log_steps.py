@@ -5,18 +5,21 @@ import pytest
 import scipy.ndimage
 from scipy.signal import filtfilt
 
-from examples.cleaning_steps import InterpolateHeld, PolynomialFit, RowClock, SubtractStart
 from pinn_dyn.data.logs import (
     Butterworth,
     Deduplicate,
     InputDelay,
     InputRates,
+    InterpolateHeld,
     LogError,
     MovingAverage,
+    PolynomialFit,
     RemoveJumps,
     Resample,
+    RowClock,
     SavitzkyGolayVelocity,
     SplitGaps,
+    SubtractStart,
 )
 from tests.data.logs_files import RATE, recording
 

@@ -56,8 +56,8 @@ def check_overrides(program, words, folder):
             assert (folder / word.split("=")[1]).is_dir()
             overrides.append(f"hydra.searchpath=[file://{folder / word.split('=')[1]}]")
         elif word not in FLAGS:
-            assert "=" in word or word.startswith("~"), f"{word} is neither a flag nor an override"
-            overrides.append(word)
+            assert "=" in word or word.startswith("~") or program == "evaluate", f"what is {word}?"
+            overrides += completed(program, [word]) if "=" not in word else [word]
     choices = [_choices(word) for word in overrides]
     first = [options[0] for options in choices]
     for index, options in enumerate(choices or [[None]]):

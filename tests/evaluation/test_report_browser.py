@@ -10,9 +10,8 @@ from tests.evaluation.report_pages import prediction_page
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 from selenium.webdriver.chrome.service import Service  # noqa: E402
-from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRIVER = shutil.which("chromedriver")
@@ -25,11 +24,7 @@ OPTIONS = (
     "--disable-background-networking --disable-component-update --disable-sync "
     "--window-size=1300,900"
 )
-# What is drawn, as pixels along every visible line.
-PATHS = (
-    "return [...document.querySelectorAll('#{} .scatterlayer path.js-line')]"
-    ".map(path => path.getAttribute('d'))"
-)
+SHOWN = "return [...document.querySelectorAll('.slider .figure:not([hidden]) img')].map(x => x.alt)"
 
 
 @pytest.fixture(scope="module")
@@ -45,48 +40,13 @@ def browser(tmp_path_factory):
     driver.quit()
 
 
-class Opened:
-    """A page in the browser: its figures by their ids, and what a reader does to them."""
-
-    def __init__(self, browser, path):
-        self.browser = browser
-        browser.get_log("browser")
-        browser.get(path.as_uri())
-        self.wait("return document.querySelectorAll('.main-svg').length > 0")
-
-    def wait(self, condition):
-        WebDriverWait(self.browser, 20, poll_frequency=0.1).until(
-            lambda driver: driver.execute_script(condition)
-        )
-
-    def lines(self, figure):
-        return self.browser.execute_script(PATHS.format(figure))
-
-    def find(self, figure, selector):
-        found = self.browser.find_elements(By.CSS_SELECTOR, f"#{figure} {selector}")
-        self.browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", found[0])
-        return found
-
-    def slide(self, figure, part):
-        """The slider of the figure to a part of its length."""
-        rail = self.find(figure, ".slider-rail-touch-rect")[0]
-        across = int((part - 0.5) * rail.size["width"])
-        ActionChains(self.browser).move_to_element_with_offset(rail, across, 0).click().perform()
-
-    def changed(self, figure, before):
-        self.wait(
-            f"return JSON.stringify((() => {{{PATHS.format(figure)}}})()) !== "
-            f"JSON.stringify({before!r})".replace("None", "null")
-        )
-        return self.lines(figure)
-
-    def fine(self):
-        """No error on the console, and not one request beyond the page itself."""
-        severe = [entry for entry in self.browser.get_log("browser") if entry["level"] == "SEVERE"]
-        loaded = self.browser.execute_script(
-            "return performance.getEntriesByType('resource').map(entry => entry.name)"
-        )
-        return not severe and not [name for name in loaded if not name.startswith("data:")]
+def is_fine(browser):
+    """No error on the console, and not one request beyond the page itself."""
+    severe = [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    loaded = browser.execute_script(
+        "return performance.getEntriesByType('resource').map(entry => entry.name)"
+    )
+    return not severe and not [name for name in loaded if not name.startswith("data:")]
 
 
 @pytest.fixture(scope="module")
@@ -96,14 +56,15 @@ def prediction(browser, tmp_path_factory):
     return path
 
 
-def test_the_slider_of_the_browser_selects_a_trajectory(browser, prediction):
-    page = Opened(browser, prediction)
-    first = page.lines("figure-trajectory")
-    page.slide("figure-trajectory", 0.99)
-    assert page.changed("figure-trajectory", first)
-    value = "return document.querySelector('#figure-trajectory .slider-label').textContent"
-    assert browser.execute_script(value) == "trajectory 4"
-    assert page.fine()
+def test_the_slider_shows_one_trajectory(browser, prediction):
+    browser.get_log("browser")
+    browser.get(prediction.as_uri())
+    assert browser.execute_script(SHOWN) == ["trajectory 0"]
+    control = browser.find_element(By.CSS_SELECTOR, ".slider input")
+    control.send_keys(Keys.END)
+    assert browser.execute_script(SHOWN) == ["trajectory 4"]
+    assert browser.find_element(By.CSS_SELECTOR, ".slider output").text == "trajectory 4"
+    assert is_fine(browser)
 
 
 def set_width(browser, width):
@@ -129,10 +90,10 @@ def test_words_of_a_wide_table_are_whole_on_a_phone(browser, tmp_path):
 @pytest.mark.parametrize("width", [390, 1280])
 def test_a_page_does_not_scroll_sideways(browser, prediction, width):
     set_width(browser, width)
-    page = Opened(browser, prediction)
+    browser.get(prediction.as_uri())
     root = "return document.documentElement.{}"
     inner = browser.execute_script(root.format("clientWidth"))
     assert browser.execute_script(root.format("scrollWidth")) <= inner
-    assert page.find("figure-trajectory", ".main-svg")[0].size["width"] <= inner
+    assert browser.find_element(By.CSS_SELECTOR, ".slider").size["width"] <= inner
     table = "const t = document.querySelector('.table'); return t.scrollWidth - t.clientWidth"
     assert width < 1280 or browser.execute_script(table) <= 0

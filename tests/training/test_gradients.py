@@ -1,6 +1,7 @@
 """Loss and gradient as one compiled program, against autograd on the eager model."""
 
 import copy
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -14,6 +15,7 @@ from pinn_dyn.models import (
     AccelerationMLP,
     ConstantCholesky,
     ConstantInput,
+    LagrangianNetwork,
     LearnedVelocity,
     NetworkCholesky,
     NetworkPotential,
@@ -98,6 +100,40 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
         for parameter in [*model.parameters(), *untouched.parameters()]:
             parameter *= 0.9
     assert_same(compiled(batches[0]), eager(batches[0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "kind_of_loss"), [(7, IncrementLoss), (12, MidpointLoss)])
+def test_programs_of_robots_with_many_joints_compile(size, kind_of_loss):
+    """The planner of Inductor's memory recurses too deeply for seven joints and RK4 windows."""
+    statistics = replace(one_step(size), v_std=torch.ones(size, dtype=torch.float64))
+    model = perturb(LagrangianNetwork(statistics).double(), spread=0.01)
+    loss = kind_of_loss(statistics, model).double()
+    windows = make_windows(4, size=size)
+    program = LossProgram(loss, model, ParameterVector(model.parameters()))
+    assert_same(program(windows, part=4), engine(Eager, loss, model)(windows))
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_an_experimental_option_of_the_compiler_cannot_end_a_training(monkeypatch, size):
+    """Small programs are compiled again without it, and large ones never get it."""
+    tried = []
+
+    def compiled(graph, arguments, options):
+        tried.append("memory_planning" in options)
+        if tried[-1]:
+            graph.graph.erase_node(next(iter(reversed(graph.graph.nodes))))  # half done
+            raise RecursionError
+        return graph
+
+    monkeypatch.setattr("torch._inductor.compile", compiled)
+    monkeypatch.setattr("pinn_dyn.mechanics.compilation.LARGEST_PLANNED", 2000)
+    model = SMALL_LNN(n=size, m=size)
+    loss = IncrementLoss(one_step(size), model).double()
+    windows = make_windows(4, size=size)
+    program = LossProgram(loss, model, ParameterVector(model.parameters()))
+    assert_same(program(windows, part=4), engine(Eager, loss, model)(windows))
+    assert tried == ([True, False] if size == 1 else [False])
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,12 @@ from pinn_dyn.data.logs.readers import READERS
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.runs import INERTIA, RESIDUAL, Equation, check_runs, equations_of_motion
 from pinn_dyn.data.logs.source import LogSource
+from pinn_dyn.data.logs.special_steps import (
+    InterpolateHeld,
+    PolynomialFit,
+    RowClock,
+    SubtractStart,
+)
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.step import Step, window_samples
@@ -36,18 +42,22 @@ __all__ = [
     "Equation",
     "InputDelay",
     "InputRates",
+    "InterpolateHeld",
     "LogError",
     "LogSource",
     "Measurement",
     "MovingAverage",
     "Part",
+    "PolynomialFit",
     "Recording",
     "RemoveJumps",
     "Request",
     "Resample",
+    "RowClock",
     "SavitzkyGolayVelocity",
     "SplitGaps",
     "Step",
+    "SubtractStart",
     "Table",
     "check_runs",
     "clear_delays",

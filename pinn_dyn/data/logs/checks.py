@@ -76,7 +76,7 @@ def check_clock(
         same[same] = table.frame.duplicated().to_numpy()[1:][same]
     bursts = _burst_share(t[np.r_[True, ~same]])
     options = f"rate: <of the rows, Hz>, longest: {2 * spacing.max():.2g}"
-    text = f"its stamps come in bursts: use examples.cleaning_steps.RowClock ({options})"
+    text = f"its stamps come in bursts: use pinn_dyn.data.logs.RowClock ({options})"
     row_clock = f"{text}, or " if bursts > _BURSTS else ""
     steps = f"as in{clock_steps(t)}"
     split = "name the column that tells runs apart in 'trajectory' (run=... of pinn_dyn.fit)"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,7 +50,7 @@ class LogSource(DataSource):
     mappings, as ``q={"columns": ["q1", "q2"], "unit": "deg"}``.
 
     Args:
-        name: short name, for tables and titles.
+        name: short name, for tables and titles; None takes that of the first file.
         files: names or glob patterns in the folder ``root``; or a data frame, or data frames by the
             name of their run. Files that hold parts of the columns are joined.
         root: folder of the files.
@@ -78,7 +80,7 @@ class LogSource(DataSource):
     def __init__(
         self,
         *,
-        name: str,
+        name: str | None = None,
         files: str | Sequence[str] | pd.DataFrame | Mapping[str, pd.DataFrame],
         root: str = ".",
         time: Clock | Columns | Mapping[str, Any] | str,
@@ -99,8 +101,10 @@ class LogSource(DataSource):
         interpolation: Interpolation = "linear",
         angles: Sequence[int] = (),
     ):
-        self.name = name
         self.files = {"frame": files} if isinstance(files, pd.DataFrame) else files
+        paths = [self.files] if isinstance(self.files, str) else list(self.files)
+        first = "frame" if isinstance(self.files, Mapping) else Path(paths[0]).stem
+        self.name = name or re.sub(r"[^\w-]+", "", first) or "log"
         self.root = root
         if isinstance(time, str):
             time = {"columns": time}

@@ -6,7 +6,7 @@ import base64
 import datetime
 import html
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,8 +15,6 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from plotly import graph_objects
-from plotly.offline import get_plotlyjs
 
 from pinn_dyn.evaluation.tables import best, formatted
 
@@ -26,11 +24,7 @@ _TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_PLOTLY_OPTIONS = {
-    "displaylogo": False,
-    "responsive": True,
-    "modeBarButtonsToRemove": ["sendChartToCloud", "lasso2d", "select2d"],  # sends nothing
-}
+_SIZE = 600_000  # of the figures of a slider, bytes
 # Patterns of Markdown that make links and load pictures.
 _LINKS = (
     *("link", "reference", "short_reference", "autolink", "automail"),
@@ -62,14 +56,12 @@ class Origin:
 
 
 def page(title: str, subtitle: str, sections: Sequence[Section]) -> str:
-    """Return the page. It loads nothing; plotly.js is embedded where a figure needs it."""
-    interactive = any("plotly-graph-div" in part for item in sections for part in item.parts)
+    """Return the page, which loads nothing."""
     return _TEMPLATES.get_template("page.html").render(
         title=title,
         subtitle=subtitle,
         date=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         sections=sections,
-        plotly=Markup(get_plotlyjs()) if interactive else "",
     )
 
 
@@ -102,25 +94,42 @@ def from_markdown(text: str) -> Markup:
 
 
 def picture(content: bytes, kind: str, text: str, width: float | None = None) -> Markup:
-    """Return an embedded image of the kind ``gif`` or ``png`` with its description."""
+    """Return an embedded image of the kind ``gif`` or ``webp`` with its description."""
     data = base64.b64encode(content).decode()
     style = "" if width is None else f"width: {width:.0f}px"
     image = Markup('<img src="data:image/{};base64,{}" alt="{}" style="{}">')
     return Markup('<div class="figure">{}</div>').format(image.format(kind, data, text, style))
 
 
-def drawing(figure: Figure, text: str) -> Markup:
-    """Return a matplotlib figure, embedded as PNG."""
+def drawing(figure: Figure, text: str, dpi: int = 140) -> Markup:
+    """Return a matplotlib figure, embedded as WebP."""
     file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=140)
-    return picture(file.getvalue(), "png", text, width=96 * figure.get_figwidth())
+    figure.savefig(file, format="webp", dpi=dpi, pil_kwargs={"quality": 60})
+    return picture(file.getvalue(), "webp", text, width=96 * figure.get_figwidth())
 
 
-def interactive(figure: graph_objects.Figure, name: str) -> Markup:
-    """Return an interactive plotly figure with an id."""
-    height = f"{figure.layout.height}px"
-    options = {"config": _PLOTLY_OPTIONS, "default_height": height, "auto_play": False}
-    return Markup(figure.to_html(full_html=False, include_plotlyjs=False, div_id=name, **options))
+def slider(figures: Iterable[tuple[int, Figure]], name: str) -> Markup:
+    """Return a slider over numbered figures of equal panels, which first shows the first one.
+
+    Figures are drawn until they reach the size that a page affords. ``name`` is the word before
+    their numbers. Without scripts, a browser shows all.
+    """
+    drawings: dict[int, Markup] = {}
+    places = None
+    for number, figure in figures:
+        if places is not None:  # of the same panels; computing them takes longer than drawing
+            figure.set_layout_engine("none")
+            for ax, place in zip(figure.axes, places, strict=True):
+                ax.set_position(place)
+        drawings[number] = drawing(figure, f"{name} {number}", dpi=80)
+        places = [ax.get_position() for ax in figure.axes]
+        if sum(map(len, drawings.values())) > _SIZE:
+            break
+    numbers = sorted(drawings)
+    text = '<input type="range" max="{}" value="{}" aria-label="{}"><output></output>'
+    control = Markup(text).format(len(numbers) - 1, numbers.index(next(iter(drawings))), name)
+    content = Markup("").join([control, *(drawings[number] for number in numbers)])
+    return Markup('<div class="slider">{}</div>').format(content)
 
 
 def table(frame: pd.DataFrame, *, headers: Mapping[str, str] | None = None) -> Markup:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -9,17 +10,16 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from pinn_dyn.evaluation.figures import ERROR
+from pinn_dyn.evaluation.figures import ERROR, trajectory_figure
 from pinn_dyn.evaluation.identification import OPEN
 from pinn_dyn.evaluation.plots import with_unit
-from pinn_dyn.evaluation.report.browser import MAX_TRAJECTORIES, trajectory_browser
 from pinn_dyn.evaluation.report.page import (
     Section,
     details,
     drawing,
-    interactive,
     page,
     paragraph,
+    slider,
     table,
 )
 from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns, unbeaten_baselines
@@ -27,6 +27,8 @@ from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns, unbeaten_
 if TYPE_CHECKING:
     from pinn_dyn.evaluation.evaluation import Evaluation
 
+MAX_TRAJECTORIES = 20
+"""Largest number of trajectories that the slider offers."""
 _TORQUE = (
     "Error of the inverse dynamics on the same motions: RMS of τ̂ − τ with τ = A(q) u, spread of τ, "
     "and their ratio."
@@ -75,22 +77,29 @@ def _summary(item: Evaluation) -> Iterator[Markup]:
 def _trajectories(item: Evaluation, first: int) -> Iterator[Markup]:
     trained = item.summary[~item.summary["baseline"]]
     worst = dict(zip(trained["run"], trained["worst_trajectory"], strict=True))
+    order = {
+        run: x.error().mean(dim=1).nan_to_num(math.inf).argsort() for run, x in item.models.items()
+    }
+    median = {run: int(indices[len(indices) // 2]) for run, indices in order.items()}
     count = len(item.truth.q)
-    offered = list(dict.fromkeys([first, *worst.values(), *range(count)]))[:MAX_TRAJECTORIES]
-    browser = trajectory_browser(
-        item.truth,
-        item.models,
-        item.best_baseline,
-        labels=item.source.labels,
-        input_labels=item.source.input_labels,
-        trajectories=offered,
+    offered = dict.fromkeys([first, *worst.values(), *median.values(), *range(count)])
+    numbers = list(offered)[:MAX_TRAJECTORIES]
+    figures = (
+        trajectory_figure(
+            item.truth,
+            item.models,
+            trajectory=number,
+            title="",
+            labels=item.source.labels,
+            input_labels=item.source.input_labels,
+            baselines=item.best_baseline,
+        )
+        for number in numbers
     )
-    yield interactive(browser, "figure-trajectory")
-    lines = [f"{run}: {index}" for run, index in worst.items()]
-    text = f"Worst trajectory of each run: {'; '.join(lines)}."
-    if len(offered) < count:
-        text += f" The slider offers {len(offered)} of {count} trajectories."
-    yield paragraph(f"{text} A click on a name of the legend hides or shows its lines.")
+    yield slider(zip(numbers, figures, strict=True), "trajectory")
+    for name, indices in (("Median", median), ("Worst", worst)):
+        lines = "; ".join(f"{run}: {index}" for run, index in indices.items())
+        yield paragraph(f"{name} trajectory of each run: {lines}.")
 
 
 def _constants(constants: Mapping[str, pd.DataFrame]) -> Iterator[Markup]:

@@ -1,7 +1,4 @@
-"""Cleaning steps for the peculiarities of single logs; templates for your own steps.
-
-A data set names them as ``{_target_: examples.cleaning_steps.SubtractStart, samples: 0.5 s}``.
-"""
+"""Cleaning steps for the peculiarities of single logs; templates for your own steps."""
 
 from __future__ import annotations
 
@@ -12,7 +9,9 @@ import numpy as np
 from numpy.polynomial import polynomial
 from pydantic import PositiveFloat, PositiveInt
 
-from pinn_dyn.data.logs import LogError, Recording, Step, window_samples
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs.step import Step, window_samples
 
 
 @dataclass(frozen=True)
