@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -13,7 +14,9 @@ from pinn_dyn.app.config import ConfigError, build_part, checked, naming, write_
 from pinn_dyn.app.known_data import match_structure
 from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data import LogSource
+from pinn_dyn.evaluation.log_check import LogCheck
 from pinn_dyn.evaluation.log_check import check as check_log
+from pinn_dyn.evaluation.structure_check import SCALE
 from pinn_dyn.systems import RigidChain
 
 
@@ -37,6 +40,7 @@ def check(cfg: DictConfig) -> None:
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
     if structure is not None:
         options = [option for option in report.options if "friction" not in option]  # the default
+        options += _gains(report) if "model/input=servo" not in options else []
         print(f"a training of its constants: {_training(options, True)}")
     elif report.options:
         names = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
@@ -47,6 +51,19 @@ def check(cfg: DictConfig) -> None:
         )
     if report.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")
+
+
+def _gains(report: LogCheck) -> list[str]:
+    """Return the options for inputs that are no forces, with the gains that the URDF suggests."""
+    units = report.source.u.units
+    if set(units) <= {"Nm", "N"}:
+        return []
+    scales = np.array([x.value for x in report.measurements if x.name == SCALE])
+    clear = scales[scales > 0]
+    usual = 1 / float(np.median(clear)) if len(clear) else 10.0
+    gains = [1 / x if x > 0 else usual for x in scales.tolist()] or [usual] * len(units)
+    values = ",".join(f"{gain:.2g}" for gain in gains)
+    return [f"model.drive_gain=[{values}]", "model.gain_spread=0.5"]
 
 
 def _training(options: list[str], with_structure: bool = False) -> str:

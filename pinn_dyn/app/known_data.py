@@ -6,13 +6,15 @@ import logging
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import ModelBuilder
 from pinn_dyn.data import DataSource, LogSource
-from pinn_dyn.mechanics import Predictor
+from pinn_dyn.evaluation.structure_check import compare_structure
+from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.systems import RigidChain
 
@@ -149,6 +151,21 @@ def check_known(model: Predictor, source: DataSource) -> None:
                 f"the inputs are {', '.join(inputs)}, no forces: set drive gains, as "
                 "model.drive_gain=10 model.gain_spread=0.5, or correct dataset.u.unit"
             )
+
+
+def warn_of_structure(model: Predictor, source: DataSource) -> None:
+    """Warn if the URDF of known mechanics contradicts the log, with the likely cause."""
+    model = model.known if isinstance(model, KnownAndNetwork) else model
+    if not isinstance(model, KnownMechanics) or not isinstance(source, LogSource) or model.servo:
+        return
+    size = len(source.u.columns)
+    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
+    training = [replace(item, u=item.u[:, :size]) for item in training]
+    step = training[0].sample_time("a comparison with the URDF")
+    structure = double_copy(model).structure
+    for item in compare_structure(structure, training, (), source.u, step):
+        if item.verdict != "ok":
+            log.warning("%s: %s", source.name, item.text)
 
 
 def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:

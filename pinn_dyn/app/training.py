@@ -24,7 +24,7 @@ from pinn_dyn.app.command import hush
 from pinn_dyn.app.config import ConfigError, naming
 from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.described import described
-from pinn_dyn.app.known_data import check_known, match_model
+from pinn_dyn.app.known_data import check_known, match_model, warn_of_structure
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run import TRAJECTORIES, VALIDATION_ERROR, ModelBuilder, Run
 from pinn_dyn.app.run_folder import (
@@ -408,6 +408,7 @@ def _learner(
         predictor = build_predictor(model, statistics, seed, ensemble)
         _check_windows(predictor, windows)
     check_known(predictor, windows.source)
+    warn_of_structure(predictor, windows.source)
     return build_learner(predictor, statistics, rollouts, **parts)
 
 

@@ -134,7 +134,7 @@ class LogCheck:
         lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
         if self.block:
             lines += ["", "Append to the data set:", "", self.block]
-        if self.options:
+        if self.options and self.rigid is None:
             lines += ["", f"Options of a training: model=lnn {' '.join(self.options)}"]
         return "\n".join(lines)
 

@@ -18,6 +18,8 @@ from pinn_dyn.models.known import Structure
 from pinn_dyn.systems import RigidChain
 
 SECTION = "docs/known_mechanics.md#does-the-urdf-fit-the-log"
+SCALE = "torque over that of the URDF's bodies"
+"""Name of the measurement of the scale of an input; NaN where it is not clear."""
 _UNEXPLAINED = 0.05  # share of the variance of a torque from which a URDF may be wrong
 _WORSE = 4.0  # unexplained share over that of a generic equation
 _EXPLAINS = 0.3  # unexplained share with a cause over that without, at most
@@ -237,6 +239,6 @@ def _scales(structure: RigidChain, data: Averages, u: Columns) -> list[Measureme
             f"{joint}: is it {cause}? Correct the column or its unit, or the masses of the URDF"
         )
         expected = f"{1 / _SCALE:g} to {_SCALE:g}" if forces else "above 0"
-        measured = ("torque over that of the URDF's bodies", joint, scale, expected)
-        results.append(_judged(*measured, clear and wrong, text))
+        value = scale if clear else np.nan
+        results.append(_judged(SCALE, joint, value, expected, clear and wrong, text))
     return results

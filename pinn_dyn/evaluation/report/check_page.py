@@ -43,7 +43,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
     if check.block:
         text = "Entries that follow from the measured delay and noise, to append to the data set:"
         verdict += [paragraph(text), preformatted(check.block)]
-    if check.options:
+    if check.options and check.rigid is None:
         verdict.append(paragraph(f"Options of a training: model=lnn {' '.join(check.options)}"))
     cleaning = cleaning_figure(
         source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
