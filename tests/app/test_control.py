@@ -13,7 +13,7 @@ from PIL import Image
 import pinn_dyn
 from pinn_dyn.app.config import CONF
 from pinn_dyn.app.control import _guarded
-from pinn_dyn.control import DisturbanceObserver, Tracking
+from pinn_dyn.control import Tracking
 from pinn_dyn.systems import RigidChain
 from tests.app.entry import (
     HIGH,
@@ -186,18 +186,12 @@ def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
 ):
     written = []
     monkeypatch.setattr("pinn_dyn.control.export.write", lambda *given: written.append(given))
-    monkeypatch.setattr(
-        "pinn_dyn.control.export._export_package", lambda *given, **_: written.append(given)
-    )
     words = ["rate=200", "~controllers.pd", "~controllers.truth", "duration=0.1", "settled_after=0"]
     words += ["controllers=tracking", "exported_law=learned_observer", "export_real=float"]
-    for ending in ("c", "pt2"):
-        control(tmp_path / ending, lnn_run, f"export={tmp_path}/law.{ending}", *words)
-    ((law,), path, info, real), package = written
+    control(tmp_path / "c", lnn_run, f"export={tmp_path}/law.c", *words)
+    (((law,), path, info, real),) = written
     assert (law.name, path.name, real) == ("control", "law.c", "float")
     assert info["observer"] == {"bandwidth": 200.0}
-    assert package[1].suffix == ".pt2"
-    assert isinstance(package[0], DisturbanceObserver)
 
 
 @pytest.mark.parametrize(
