@@ -85,4 +85,3 @@ def export_law(
         text += f" q_ref, v_ref and a_ref are the reference {safe.compensation.ahead:g} s ahead."
     law = ExportedFunction("control", safe, inputs, ("u", "status", "memory_out"), text)
     return write([law], path, info, real)
-

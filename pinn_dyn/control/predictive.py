@@ -154,7 +154,8 @@ class PredictiveControl(Controller):
         begin = time.perf_counter()
         ahead = self._ahead(t, len(states), reference)
         shared = (time.perf_counter() - begin) / len(states)
-        values = [self._advance(k, t, x, *(y[k] for y in ahead)) for k, x in enumerate(states)]
+        with np.errstate(invalid="ignore"):  # of a state that is not finite
+            values = [self._advance(k, t, x, *(y[k] for y in ahead)) for k, x in enumerate(states)]
         self._diagnostics = {
             key: q.new_tensor([value[key] for value in values]).reshape(q.shape[:-1])
             for key in values[0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import yaml
@@ -69,10 +68,9 @@ class DesignedMotion:
         points = []
         for k in range(0, len(self.t), self._stride(_MESSAGE_RATE)):
             seconds, nanoseconds = divmod(round(1e9 * (approach + float(self.t[k]))), 10**9)
-            values = zip(names, (self.q, self.v, self.a), strict=True)
-            point: dict[str, Any] = {x: [float(f"{y:.6g}") for y in z[k].tolist()] for x, z in values}
-            point["time_from_start"] = {"sec": seconds, "nanosec": nanoseconds}
-            points.append(point)
+            values = [[float(f"{y:.6g}") for y in x[k].tolist()] for x in (self.q, self.v, self.a)]
+            time = {"sec": seconds, "nanosec": nanoseconds}
+            points.append({**dict(zip(names, values, strict=True)), "time_from_start": time})
         message = {"joint_names": self.joint_names, "points": points}
         return yaml.safe_dump(message, default_flow_style=True, sort_keys=False, width=120)
 

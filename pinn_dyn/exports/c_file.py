@@ -51,7 +51,7 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     for function, body in zip(functions, bodies, strict=True):
         signature = _signature(function, name, real)
         declarations += [
-            f"/* {function.about} Stack: {body.stack} bytes. */".replace("/*  ", "/* "),
+            f"/* {function.about} Stack: at most {body.stack} bytes. */".replace("/*  ", "/* "),
             f"{signature};",
         ]
         unused = [f"(void){x};" for x in function.inputs]
@@ -111,9 +111,7 @@ def _compilers() -> list[str]:
     return [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
 
 
-def compile_c(
-    compiler: Sequence[str], flags: Sequence[str], source: Path, code: str = ""
-) -> Path:
+def compile_c(compiler: Sequence[str], flags: Sequence[str], source: Path, code: str = "") -> Path:
     """Compile a C file to a ``.so`` beside it. With the flag ``-``, add the code to it.
 
     Raises:
@@ -121,9 +119,7 @@ def compile_c(
     """
     library = source.with_suffix(".so")
     command = [*compiler, *flags, "-o", library.name, f"./{source.name}", "-lm"]
-    result = subprocess.run(
-        command, cwd=source.parent, input=code, capture_output=True, text=True
-    )
+    result = subprocess.run(command, cwd=source.parent, input=code, capture_output=True, text=True)
     if result.returncode:
         lines = [*result.stderr.splitlines(), "no message"]
         problem = next((line for line in lines if "error" in line), lines[0])

@@ -167,7 +167,7 @@ def _file(robot: RigidChain) -> UrdfFile:
                 return UrdfFile(path)
         except (OSError, ValueError):
             pass
-        log.warning("%s is missing or has changed: the export has no shapes", path)
+        log.warning("%s is missing, changed or an MJCF: the export has no shapes", path)
     return UrdfFile(urdf)
 
 

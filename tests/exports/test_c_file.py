@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import subprocess
 
 import numpy as np
@@ -152,6 +153,21 @@ def test_powers_are_powers_and_constants_of_floats_are_floats(tmp_path):
     path = write([powers], tmp_path / "f.c", {}, "float")
     command = ["cc", *STRICT, "-Wdouble-promotion", "-c", path.name, "-o", "f.o"]
     subprocess.run(command, cwd=tmp_path, check=True)
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_the_stack_of_the_header_suffices(tmp_path, real):
+    model = MODELS[CONSTANT]().double().eval().requires_grad_(False)
+    path = export(model, tmp_path / "arm.c", real=real)
+    header = path.with_suffix(".h").read_text()
+    stated = re.findall(r"Stack: at most (\d+) bytes. \*/\n\w+ (\w+)\(", header)
+    for level in ("-O1", "-O3"):
+        command = ["gcc", *STRICT, level, "-fstack-usage", "-c", path.name]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        lines = (tmp_path / "arm.su").read_text().splitlines()
+        sizes = {line.split(":")[-1].split()[0]: int(line.split("\t")[1]) for line in lines}
+        assert len(stated) == 4
+        assert all(sizes[name] <= int(size) for size, name in stated)
 
 
 # Operations that the models of this package do not use.

@@ -53,9 +53,7 @@ def rebuilt(monkeypatch):
     """True if the next library is compiled instead of loaded from the cache."""
     compilations = []
     compile_c = c_library.compile_c
-    monkeypatch.setattr(
-        c_library, "compile_c", lambda *x: compilations.append(x) or compile_c(*x)
-    )
+    monkeypatch.setattr(c_library, "compile_c", lambda *x: compilations.append(x) or compile_c(*x))
     assert load_code(LIBRARY).number() == 7
     return bool(compilations)
 

@@ -16,6 +16,7 @@ from pinn_dyn.control import (
     export_law,
 )
 from pinn_dyn.control.region import FallBack
+from pinn_dyn.control.safe_law import SafeLaw
 from pinn_dyn.mechanics import InputSolver
 from pinn_dyn.systems import TendonArm
 from tests.models.builders import VARIANTS, make_structured
@@ -133,6 +134,18 @@ def test_numbers_that_are_not_finite_give_the_last_input(law, tmp_path):
     u, status = control(*good)
     assert np.isfinite(u).all()
     assert not status & 4
+
+
+@pytest.mark.parametrize("bad", [[-np.inf, 0, 0], [np.inf, -np.inf, 0], [0, np.nan, 0]])
+def test_an_input_that_is_not_finite_gives_the_last_whatever_its_sum(law, monkeypatch, bad):
+    """The sum of minus infinity is less than every number."""
+    safe = SafeLaw(law)
+    u, last = torch.tensor(bad).double(), torch.tensor([1.0, 2.0, 3.0]).double()
+    monkeypatch.setattr(law, "law", lambda *state: u)
+    result, status, memory = safe(*[torch.zeros(3).double()] * 5, last)
+    assert status == 4
+    assert torch.equal(result, last)
+    assert torch.equal(memory, last)
 
 
 def test_a_held_input_does_not_spoil_the_memory_of_the_observer(law, tmp_path):
