@@ -184,7 +184,11 @@ def _call(
         command = [str(program), function.name]
         try:
             result = subprocess.run(
-                command, input=states.tobytes(), stdout=-1, timeout=TIME_LIMIT, check=True
+                command,
+                input=states.tobytes(),
+                stdout=subprocess.PIPE,
+                timeout=TIME_LIMIT,
+                check=True,
             )
         except (OSError, subprocess.SubprocessError) as error:
             raise RuntimeError(f"{function.name} cannot be compared: {error}") from error
