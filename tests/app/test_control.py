@@ -13,7 +13,7 @@ from PIL import Image
 import pinn_dyn
 from pinn_dyn.app.config import CONF
 from pinn_dyn.app.control import _guarded
-from pinn_dyn.control import Tracking
+from pinn_dyn.control import Tracking, export_law
 from pinn_dyn.systems import RigidChain
 from tests.app.entry import (
     HIGH,
@@ -179,6 +179,15 @@ def test_the_guard_acts_and_is_exported_with_the_observer(tmp_path, lnn_run, und
     u, _, status = function_of(path, "law_control")(far, far, far, far, far, memory)
     np.testing.assert_allclose(u, 0.2)
     assert status == 2
+
+
+def test_a_law_on_the_model_of_a_run_has_the_names_of_its_joints(tmp_path, monkeypatch, lnn_run):
+    written = []
+    monkeypatch.setattr("pinn_dyn.control.export.write", lambda *given: written.append(given))
+    run = pinn_dyn.load(lnn_run)
+    export_law(Tracking(run.system, 1.0, 1.0), tmp_path / "law.c")
+    assert written[0][2]["q"] == run.labels
+    assert written[0][2]["u"] == run.input_labels
 
 
 def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
