@@ -14,6 +14,7 @@ import pinn_dyn
 from pinn_dyn.app.config import CONF
 from pinn_dyn.app.control import _guarded
 from pinn_dyn.control import Tracking, export_law
+from pinn_dyn.exports.escaping import c_text
 from pinn_dyn.systems import RigidChain
 from tests.app.entry import (
     HIGH,
@@ -150,8 +151,8 @@ def test_the_learned_law_is_exported_with_its_limits_and_guard(
     header = path.with_suffix(".h").read_text()
     for part in (
         f"#define law_MEMORY_SIZE {size}",
-        '\\"period\\": 0.005',
-        '\\"fallback\\": \\"hold\\"',
+        c_text('"period": 0.005'),
+        c_text('"fallback": "hold"'),
     ):
         assert part in header
 
