@@ -167,7 +167,7 @@ def _file(robot: RigidChain) -> UrdfFile:
                 return UrdfFile(path)
         except (OSError, ValueError):
             pass
-        log.warning("%s is missing, changed or an MJCF: the export has no shapes", path)
+        log.warning("%s is missing, has changed or is an MJCF: no shapes are written", path)
     return UrdfFile(urdf)
 
 
