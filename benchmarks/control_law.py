@@ -31,7 +31,7 @@ from hydra import compose, initialize_config_dir
 from pinn_dyn.app.config import CONF, plain
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import load_run
-from pinn_dyn.control import Tracking, export_law, load_law
+from pinn_dyn.control import Tracking, export_law
 from pinn_dyn.control.export import INPUTS
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.predictor import double_copy
@@ -168,7 +168,7 @@ def main() -> None:
     arrays = [tuple(x.numpy() for x in state) for state in tensors]
     with tempfile.TemporaryDirectory() as name, torch.inference_mode(False):
         folder, paths = Path(name), {}
-        for ending in ("c", "pt2", "onnx", "casadi"):
+        for ending in ("c", "onnx", "casadi"):
             start = time.perf_counter()
             try:
                 path = paths[ending] = export_law(eager, folder / f"law.{ending}")
@@ -177,12 +177,7 @@ def main() -> None:
                 continue
             seconds, size = time.perf_counter() - start, path.stat().st_size / 1e6
             print(f"export to .{ending}: {seconds:.1f} s, {size:.2f} MB")
-        compiled = load_law(paths["pt2"])
-        bare = torch._inductor.aoti_load_package(str(paths["pt2"]), run_single_threaded=True).loader
-        calls: dict[str, Call] = {
-            "PyTorch .pt2": (lambda *x: bare.run(list(x))[0], tensors),
-            "PyTorch .pt2, load_law": (compiled, tensors),
-        }
+        calls: dict[str, Call] = {}
         if "onnx" in paths:
             import onnxruntime
 
@@ -192,9 +187,10 @@ def main() -> None:
             names = [item.name for item in session.get_inputs()]
 
             def runtime(*x: np.ndarray) -> Any:
-                return session.run(["u"], dict(zip(names, [*x, memory], strict=True)))[0]
+                return session.run(["u"], dict(zip(names, [*x, memory[None]], strict=True)))[0][0]
 
-            calls["ONNX Runtime"] = (runtime, arrays)
+            batches = [tuple(x[None] for x in state) for state in arrays]
+            calls["ONNX Runtime"] = (runtime, batches)
         if "casadi" in paths:
             import casadi
 

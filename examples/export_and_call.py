@@ -1,32 +1,42 @@
-"""Compile a control law into one file that needs PyTorch alone, and call it at 1 kHz.
+"""Write a control law as C code, compile it, and compare it with the law in Python.
 
-python examples/export_and_call.py runs/own_log [--file law.pt2]    needs a C++ compiler
+python examples/export_and_call.py runs/own_log [--file law.c]    needs a C compiler
 """
 
 import argparse
+import ctypes
+import subprocess
 import time
+from pathlib import Path
 
+import numpy as np
 import torch
 
 import pinn_dyn
-from pinn_dyn.control import Tracking, export_law, load_law
+from pinn_dyn.control import Actuator, Tracking, export_law
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("run", help="a run folder of model=lnn or hnn")
-parser.add_argument("--file", default="law.pt2", help="where the law goes")
+parser.add_argument("--file", type=Path, default=Path("law.c"), help="where the law goes")
 args = parser.parse_args()
 
-model = pinn_dyn.load(args.run)
-eager = Tracking(model.system, position_gain=2.0, velocity_gain=0.2)
-law = load_law(export_law(eager, args.file))
+run = pinn_dyn.load(args.run)
+eager = Tracking(run.system, position_gain=2.0, velocity_gain=0.2)
+export_law(eager, args.file, actuator=Actuator(low=-100.0, high=100.0))
+library = args.file.resolve().with_suffix(".so")
+subprocess.run(["cc", "-O3", "-fPIC", "-shared", "-o", library, args.file, "-lm"], check=True)
+law = getattr(ctypes.CDLL(str(library)), f"{args.file.stem}_control")
 
-q, v, q_ref, v_ref, a_ref = torch.zeros(5, model.system.num_coordinates, dtype=torch.float64)
-q_ref = q_ref + 0.1
-u = law(q, v, q_ref, v_ref, a_ref)
-print("u:", dict(zip(model.input_labels, u.numpy().round(4), strict=True)))
-print("the same as before the export:", torch.allclose(u, eager.law(q, v, q_ref, v_ref, a_ref)))
+state = np.zeros((5, run.system.num_coordinates))  # q, v, q_ref, v_ref, a_ref
+state[2] = 0.1
+u, memory = np.zeros((2, run.system.num_inputs))  # the memory holds the last input
+pointers = [ctypes.c_void_p(x.ctypes.data) for x in (*state, memory, u, memory)]
+status = law(*pointers)
+print("u:", dict(zip(run.input_labels, u.round(4), strict=True)), "status:", status)
+expected = eager.law(*torch.from_numpy(state))
+print("the same as before the export:", np.allclose(u, expected, rtol=1e-9))
 
 start = time.perf_counter()
 for _ in range(1000):
-    law(q, v, q_ref, v_ref, a_ref)
+    law(*pointers)
 print(f"{1e3 * (time.perf_counter() - start):.0f} µs a call")

@@ -303,6 +303,7 @@ class Run:
         if not isinstance(self.model, MechanicalSystem):
             kind = "an ensemble" if isinstance(self.model, Ensemble) else "a black box"
             raise TypeError(f"the model is {kind} and has no terms M, D, G and A")
+        self.model.labels, self.model.input_labels = self.labels, self.input_labels
         return self.model
 
     def terms(self, q: Values) -> TermArrays:

@@ -261,8 +261,7 @@ def claimed(
 
 
 def _require_same_config(folder: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
-    # Earlier versions recorded paths of URDFs.
-    ours, theirs = flattened(now), flattened(with_structures(before))
+    ours, theirs = flattened(now), flattened(before)
     ours.pop("dataset.cache", None)
     differences = [
         f"{key}={ours.get(key)} (there {theirs.get(key)})"

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pinn_dyn.app.validation import ConfigError, places
+from pinn_dyn.systems.urdf_file import is_mjcf
 
 _PACKAGES = (
     *("control", "data", "data.logs", "evaluation", "mechanics", "models", "systems"),
@@ -71,6 +72,11 @@ def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, 
             f"{path}._target_ is {target!r}. A configuration from a run folder may name the "
             "classes of pinn_dyn and a few others only. If this is your own class and you trust "
             f"the author of the folder, add trust={str(target).split('.')[0]} (SECURITY.md)"
+        )
+    if isinstance(urdf := part.get("urdf"), str) and is_mjcf(urdf):
+        raise ConfigError(
+            f"{path}.urdf is an MJCF, which MuJoCo would have to read: a run folder holds the text "
+            f"of a URDF only; if you trust the author of the folder, add trust={target}"
         )
     for key in _DESTINATIONS:
         if part.get(key) is not None:

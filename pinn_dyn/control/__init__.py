@@ -5,7 +5,7 @@ from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.dead_time import DelayCompensation
 from pinn_dyn.control.effects import Actuator, Sensor
-from pinn_dyn.control.export import export_law, load_law
+from pinn_dyn.control.export import export_law
 from pinn_dyn.control.helix import Helix
 from pinn_dyn.control.laws import (
     ComputedTorque,
@@ -54,7 +54,6 @@ __all__ = [
     "close_loop_continuous",
     "export_law",
     "fit_factor",
-    "load_law",
     "predict_steady_state",
     "required_gain",
     "stability_report",

@@ -27,7 +27,7 @@ class Actuator:
         rate: largest rate of change in the units of u per s, likewise.
 
     Raises:
-        ValueError: if low exceeds high.
+        ValueError: if low exceeds high, or is NaN.
     """
 
     low: _Values = None
@@ -37,8 +37,8 @@ class Actuator:
 
     def __post_init__(self) -> None:
         low = -np.inf if self.low is None else np.asarray(self.low)
-        if np.any(low > (np.inf if self.high is None else np.asarray(self.high))):
-            raise ValueError(f"Actuator: low is {self.low} and high {self.high}: low exceeds high")
+        if not np.all(low <= (np.inf if self.high is None else np.asarray(self.high))):
+            raise ValueError(f"Actuator: low {self.low} and high {self.high}, expected low <= high")
 
     def reset(self) -> None:
         """Return to an input of zero, before a new run."""

@@ -47,7 +47,8 @@ class PredictiveControl(Controller):
     within limits of the state, if the loop calls :meth:`follow`, as :func:`close_loop` does.
 
     u_ref is A^+ times the inverse dynamics of the reference, within the limits. It is zero for a
-    force that is not linear in the input. If the solver fails, the law holds the last input.
+    force that is not linear in the input. If the solver fails, as for a state that is not finite,
+    the law holds the last input.
 
     Args:
         model: the mechanical system to plan with, in float64.
@@ -136,8 +137,11 @@ class PredictiveControl(Controller):
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
 
         Raises:
-            ValueError: on a time before the previous call, or a first state beyond its limits.
+            ValueError: on a time before the previous call, a first state beyond its limits, or a
+                time or reference that is not finite.
         """
+        if not math.isfinite(t):
+            raise ValueError(f"t is {t}, expected the time of the call in s")
         states = torch.cat([q, v], -1).reshape(-1, 2 * self.num_coordinates).double().cpu().numpy()
         if not self._memory:
             self._start(t, states)
@@ -150,7 +154,8 @@ class PredictiveControl(Controller):
         begin = time.perf_counter()
         ahead = self._ahead(t, len(states), reference)
         shared = (time.perf_counter() - begin) / len(states)
-        values = [self._advance(k, t, x, *(y[k] for y in ahead)) for k, x in enumerate(states)]
+        with np.errstate(invalid="ignore"):  # of a state that is not finite
+            values = [self._advance(k, t, x, *(y[k] for y in ahead)) for k, x in enumerate(states)]
         self._diagnostics = {
             key: q.new_tensor([value[key] for value in values]).reshape(q.shape[:-1])
             for key in values[0]
@@ -204,6 +209,11 @@ class PredictiveControl(Controller):
             torch.stack([x.double().cpu().expand(count, n) for x in values], -2)
             for values in zip(*motions, strict=True)
         )
+        missing = (~torch.cat([q, v, a], -1).isfinite()).nonzero()
+        if len(missing):
+            _, step, k = missing[0].tolist()
+            name = f"{'qva'[k // n]}[{k % n}]"
+            raise ValueError(f"the reference of {name} at {times[step]:g} s is not finite")
         # Beyond a limit, the weight of the goal would exceed that of the limit.
         states = torch.cat([q, v], -1).clip(*map(torch.from_numpy, self.limits[:2]))
         (q, v), x = states.split(n, -1), states.numpy()
@@ -280,7 +290,8 @@ class PredictiveControl(Controller):
         n, period = self.num_coordinates, t - last.t
         modeled = self.problem.accelerations(np.concatenate([(last.x + x) / 2, last.u]))
         measured = (x[n:] - last.x[n:]) / period - modeled
-        return last.d - math.expm1(-self._bandwidth * period) * (measured - last.d)
+        d = last.d - math.expm1(-self._bandwidth * period) * (measured - last.d)
+        return d if np.isfinite(d).all() else last.d
 
     def _warn_of_excess(self, k: int, plan: Plan) -> None:
         """Warn if the first plan cannot keep a limit of the state."""
@@ -296,6 +307,6 @@ class PredictiveControl(Controller):
 
 def _row(name: str, value: _Values, size: int, missing: float = 0.0) -> np.ndarray:
     array = np.asarray(missing if value is None else value, dtype=float)
-    if array.shape not in ((), (size,)):
+    if array.shape not in ((), (size,)) or np.isnan(array).any():
         raise ValueError(f"{name} is {array.tolist()}, expected 1 or {size} numbers")
     return np.broadcast_to(array, (size,)).copy()

@@ -192,7 +192,8 @@ class ShootingProblem:
             iterations: largest number of quadratic programs.
 
         Raises:
-            FloatingPointError: if a quadratic program has no solution.
+            FloatingPointError: on a number that is not finite, or if a quadratic program has no
+                solution.
         """
         (n, m), steps, limits = self.sizes, self.steps, self.limits
         lows, highs, rated = self._rows
@@ -229,6 +230,8 @@ class ShootingProblem:
         while count < iterations:
             count += 1
             slopes = np.concatenate(self.slopes(points), axis=-1)
+            if not (np.isfinite(rows).all() and np.isfinite(slopes).all()):
+                raise FloatingPointError("the state or an acceleration is not finite")
             gradient, jacobian = self._slopes(w, *arguments, slopes)
             solution = self._quadratic(
                 h=H,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+import yaml
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -63,16 +64,15 @@ class DesignedMotion:
 
         The controller moves the robot from its pose to the start of the motion in ``approach`` s.
         """
-        lines = []
+        names = ("positions", "velocities", "accelerations")
+        points = []
         for k in range(0, len(self.t), self._stride(_MESSAGE_RATE)):
             seconds, nanoseconds = divmod(round(1e9 * (approach + float(self.t[k]))), 10**9)
-            names = ("positions", "velocities", "accelerations")
-            values = zip(names, (self.q, self.v, self.a), strict=True)
-            numbers = [f"{x}: [{', '.join(f'{y:.6g}' for y in z[k].tolist())}]" for x, z in values]
-            time = f"time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}"
-            lines.append(f"  {{{', '.join(numbers)}, {time}}}")
-        points = ",\n".join(lines)
-        return f"{{joint_names: [{', '.join(self.joint_names)}], points: [\n{points}]}}\n"
+            values = [[float(f"{y:.6g}") for y in x[k].tolist()] for x in (self.q, self.v, self.a)]
+            time = {"sec": seconds, "nanosec": nanoseconds}
+            points.append({**dict(zip(names, values, strict=True)), "time_from_start": time})
+        message = {"joint_names": self.joint_names, "points": points}
+        return yaml.safe_dump(message, default_flow_style=True, sort_keys=False, width=120)
 
     def figure(self) -> Figure:
         """Draw positions, velocities and torques, with dashed limits."""

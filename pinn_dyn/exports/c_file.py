@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import json
 import logging
@@ -10,19 +9,32 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import torch
 
 from pinn_dyn.exports.c_code import PRELUDE, CFunction, Constants
+from pinn_dyn.exports.escaping import c_text
 from pinn_dyn.exports.exported import Calls, ExportedFunction, Real, identifier
 
 log = logging.getLogger(__name__)
 
 STATUS = "status"
 """Output that the C function returns, as an int."""
+TIME_LIMIT = 60.0
+"""Longest time of the comparison of a function, s."""
+_LOOP = """\
+  if (strcmp(words[1], "{function}") == 0) {{
+    {real} x[{inputs}], y[{outputs}];
+    while (fread(x, sizeof x, 1, stdin) == 1) {{
+      {call};
+      fwrite(y, sizeof y, 1, stdout);
+    }}
+  }}
+"""
 
 
 def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: Real) -> Calls:
@@ -39,7 +51,7 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     for function, body in zip(functions, bodies, strict=True):
         signature = _signature(function, name, real)
         declarations += [
-            f"/* {function.about} Stack: {body.stack} bytes. */".replace("/*  ", "/* "),
+            f"/* {function.about} Stack: at most {body.stack} bytes. */".replace("/*  ", "/* "),
             f"{signature};",
         ]
         unused = [f"(void){x};" for x in function.inputs]
@@ -51,12 +63,13 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     fields = {**json.loads(info), "sha256": digest}
     sizes = {key: n for key, n in fields.items() if isinstance(n, int)}
     header = [
-        "/* Written by pinn_dyn. SI units and radians. Arrays may overlap. Compile without",
+        "/* SPDX-License-Identifier: MIT",
+        "   Written by pinn_dyn. SI units and radians. Arrays may overlap. Compile without",
         "   -ffast-math, which removes the tests for numbers that are not finite. */",
         f"#ifndef {name}_H",
         f"#define {name}_H",
-        *(f"#define {name}_{key.upper()} {n}" for key, n in sizes.items()),
-        f"#define {name}_INFO {json.dumps(json.dumps(fields))}",
+        *(f"#define {name}_{identifier(key.upper())} {n:d}" for key, n in sizes.items()),
+        f'#define {name}_INFO "{c_text(json.dumps(fields))}"',
         "#ifdef __cplusplus",
         'extern "C" {',
         "#endif",
@@ -70,13 +83,10 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     path.with_suffix(".h").write_text("\n".join([*header, ""]))
     about = f"const char *{name}_info(void) {{ return {name}_INFO; }}"
     path.write_text("\n".join([f'#include "{path.stem}.h"', *code, "", about, ""]))
-    library = _compiled(path)
-    if library is None:
+    program = _compiled(path, [_loop(function, name, real) for function in functions])
+    if program is None:
         return {}
-    return {
-        function.name: _call(getattr(library, f"{name}_{function.name}"), function, real)
-        for function in functions
-    }
+    return {function.name: _call(program, function, real) for function in functions}
 
 
 def _signature(function: ExportedFunction, name: str, real: Real) -> str:
@@ -101,15 +111,15 @@ def _compilers() -> list[str]:
     return [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
 
 
-def compile_c(compiler: Sequence[str], flags: Sequence[str], source: Path) -> Path:
-    """Compile a C file to a library beside it.
+def compile_c(compiler: Sequence[str], flags: Sequence[str], source: Path, code: str = "") -> Path:
+    """Compile a C file to a ``.so`` beside it. With the flag ``-``, add the code to it.
 
     Raises:
         RuntimeError: if the compiler fails.
     """
     library = source.with_suffix(".so")
-    command = [*compiler, *flags, "-o", library.name, source.name, "-lm"]
-    result = subprocess.run(command, cwd=source.parent, capture_output=True, text=True)
+    command = [*compiler, *flags, "-o", library.name, f"./{source.name}", "-lm"]
+    result = subprocess.run(command, cwd=source.parent, input=code, capture_output=True, text=True)
     if result.returncode:
         lines = [*result.stderr.splitlines(), "no message"]
         problem = next((line for line in lines if "error" in line), lines[0])
@@ -118,8 +128,11 @@ def compile_c(compiler: Sequence[str], flags: Sequence[str], source: Path) -> Pa
     return library
 
 
-def _compiled(path: Path) -> ctypes.CDLL | None:
-    """Compile a C file and load it; return None, with a warning, without a compiler."""
+def _compiled(path: Path, loops: Sequence[str]) -> Path | None:
+    """Compile a C file to a program that calls it; return None, with a warning, without a compiler.
+
+    The program does not run in this process, so an error in the file cannot end it.
+    """
     compiler = find_compiler()
     if compiler is None:
         log.warning(
@@ -128,29 +141,58 @@ def _compiled(path: Path) -> ctypes.CDLL | None:
             ", ".join(_compilers()),
         )
         return None
-    library = compile_c(compiler, ["-std=c99", "-O1", "-fPIC", "-shared"], path)
-    loaded = ctypes.CDLL(str(library))
-    library.unlink()
-    return loaded
+    main = [
+        f'#include <stdio.h>\n#include <string.h>\n#include "{path.stem}.h"',
+        "int main(int count, char **words)\n{\n  (void)count;",
+        *loops,
+        "  return 0;\n}\n",
+    ]
+    flags = ["-std=gnu99", "-O1", "-x", "c", "-", "-x", "none"]  # c99 would replace trigraphs
+    return compile_c(compiler, flags, path, "\n".join(main))
 
 
-def _call(pointer: Any, function: ExportedFunction, real: Real) -> Callable[..., list[np.ndarray]]:
-    dtype, number = (
-        (np.float64, ctypes.c_double) if real == "double" else (np.float32, ctypes.c_float)
+def _loop(function: ExportedFunction, name: str, real: Real) -> str:
+    """Return C code that calls a function for the states of the standard input."""
+    shapes = function.program.inputs, function.program.outputs
+    x, y = _pointers("x", shapes[0]), _pointers("y", shapes[1])
+    arguments = [pointer if len(shapes[0][key]) else f"*{pointer}" for key, pointer in x.items()]
+    status = y.pop(STATUS, None)
+    call = f"{name}_{function.name}({', '.join([*arguments, *y.values()])})"
+    return _LOOP.format(
+        function=function.name,
+        real=real,
+        inputs=sum(map(torch.Size.numel, shapes[0].values())),
+        outputs=sum(map(torch.Size.numel, shapes[1].values())),
+        call=f"*{status} = {call}" if status else call,
     )
 
-    def call(*arguments: np.ndarray) -> list[np.ndarray]:
-        inputs = [np.asarray(x, dtype, order="C") for x in arguments]
-        results = {
-            name: np.empty(tuple(shape), dtype) for name, shape in function.program.outputs.items()
-        }
-        arrays = [x for name, x in results.items() if name != STATUS]
-        values = [number(float(x)) if x.ndim == 0 else _pointer(x) for x in inputs]
-        status = pointer(*values, *map(_pointer, arrays))
-        return [np.array(status) if name == STATUS else x for name, x in results.items()]
+
+def _pointers(array: str, shapes: Mapping[str, torch.Size]) -> dict[str, str]:
+    """Return a pointer to the numbers of each input or output, one after the other in an array."""
+    starts = accumulate(map(torch.Size.numel, shapes.values()), initial=0)
+    return {name: f"&{array}[{start}]" for name, start in zip(shapes, starts, strict=False)}
+
+
+def _call(
+    program: Path, function: ExportedFunction, real: Real
+) -> Callable[..., Sequence[np.ndarray]]:
+    dtype = np.float64 if real == "double" else np.float32
+    ends = [*accumulate(map(torch.Size.numel, function.program.outputs.values()))]
+
+    def call(*inputs: np.ndarray) -> Sequence[np.ndarray]:
+        states = np.concatenate([x.reshape(len(x), -1) for x in inputs], axis=1, dtype=dtype)
+        command = [str(program), function.name]
+        try:
+            result = subprocess.run(
+                command,
+                input=states.tobytes(),
+                stdout=subprocess.PIPE,
+                timeout=TIME_LIMIT,
+                check=True,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            raise RuntimeError(f"{function.name} cannot be compared: {error}") from error
+        values = np.frombuffer(result.stdout, dtype).reshape(len(states), -1)
+        return np.split(values, ends[:-1], axis=1)
 
     return call
-
-
-def _pointer(values: np.ndarray) -> ctypes.c_void_p:
-    return values.ctypes.data_as(ctypes.c_void_p)

@@ -68,6 +68,8 @@ def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     """Compile C code for this processor, unless the cache folder has the library, and load it.
 
+    Loading a library runs its code. A file of the cache is loaded only if nobody else owns it or
+    may write it, and if its content has the SHA-256 in its name.
     ``optimization`` is a list of flags of the compiler.
 
     Raises:
@@ -80,19 +82,38 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     flags = [*_FLAGS, *optimization]
     digest = hashlib.sha256((code + _target(*compiler, *flags)).encode()).hexdigest()
     folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser() / "compiled"
-    library = folder / f"{digest}.so"
-    if not library.exists():
-        with suppress(OSError):  # a read-only folder: the library serves this process alone
-            folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder if os.access(folder, os.W_OK) else None) as name:
-            source = Path(name) / "code.c"
-            source.write_text(code)
-            compiled = compile_c(compiler, flags, source)
-            loaded = ctypes.CDLL(str(compiled))
-            with suppress(OSError):
-                os.replace(compiled, library)
-        return loaded
-    return ctypes.CDLL(str(library))
+    with suppress(OSError):  # a read-only folder: the library serves this process alone
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    is_safe = _is_safe(folder)
+    if is_safe:
+        for library in folder.glob(f"{digest}-*.so"):
+            if _is_safe(library) and library.name == f"{digest}-{_sha256(library)}.so":
+                return ctypes.CDLL(str(library))
+    elif folder.is_dir():
+        log.warning("%s is not used: others own or may write it, run chmod -R go-w there", folder)
+    is_cache = is_safe and os.access(folder, os.W_OK)
+    with TemporaryDirectory(dir=folder if is_cache else None) as name:
+        source = Path(name) / "code.c"
+        source.write_text(code)
+        compiled = compile_c(compiler, flags, source)
+        compiled.chmod(0o700)
+        loaded = ctypes.CDLL(str(compiled))
+        if is_cache:
+            os.replace(compiled, folder / f"{digest}-{_sha256(compiled)}.so")
+    return loaded
+
+
+def _is_safe(path: Path) -> bool:
+    """Return true for a file or folder that this user owns and nobody else may write."""
+    try:
+        status = path.stat()
+    except OSError:
+        return False
+    return status.st_uid == os.getuid() and not status.st_mode & 0o022
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @cache

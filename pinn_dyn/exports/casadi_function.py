@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,8 @@ from pinn_dyn.exports.program import MOVES, Program, moved, operation, unsupport
 
 if TYPE_CHECKING:
     import casadi
+
+    from pinn_dyn.exports.exported import Calls
 
 # Elementwise operations with another name in CasADi, and with the same name.
 _NAMES = {"add": "plus", "sub": "minus", "mul": "times", "div": "rdivide", "pow": "power"}
@@ -59,9 +61,7 @@ def import_casadi() -> Any:
     return casadi
 
 
-def write_casadi(
-    functions: Sequence[Any], path: Path, info: str, real: str
-) -> Mapping[str, Callable[..., list[np.ndarray]]]:
+def write_casadi(functions: Sequence[Any], path: Path, info: str, real: str) -> Calls:
     """Write a function for ``casadi.Function.load``, and return it as read from the file.
 
     The file does not hold ``info``.
@@ -74,7 +74,12 @@ def write_casadi(
     (function,) = functions
     casadi_function(function.program, function.name).save(str(path))
     loaded = import_casadi().Function.load(str(path))
-    return {function.name: lambda *x: [np.array(y) for y in loaded.call([*map(np.ravel, x)])]}
+
+    def call(*inputs: np.ndarray) -> list[np.ndarray]:
+        rows = [loaded.call([*map(np.ravel, state)]) for state in zip(*inputs, strict=True)]
+        return [np.stack([np.array(x) for x in column]) for column in zip(*rows, strict=True)]
+
+    return {function.name: call}
 
 
 class _Writer:

@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from pinn_dyn.exports.program import Program
 
 Real = Literal["double", "float"]
-Calls = Mapping[str, Callable[..., Sequence[np.ndarray]]]
-"""The functions of a written file by name, as called from Python."""
+Call = Callable[..., Sequence[np.ndarray]]
+"""Function of K values of each input, ``(K, *shape)``, which returns those of each output."""
+Calls = Mapping[str, Call]
+"""The functions of a written file by name."""
 
 Ranges = Mapping[str, tuple[Tensor, Tensor]]
 """Smallest and largest values of inputs by name, for the states of the comparison."""
@@ -66,8 +68,8 @@ class ExportedFunction:
         example = {name: values[0] for name, values in self.inputs.items()}
         return trace(self.function, example, self.outputs)
 
-    def compare(self, call: Callable[..., Sequence[np.ndarray]], tolerance: float) -> None:
-        """Compare with a function of arrays.
+    def compare(self, call: Call, tolerance: float) -> None:
+        """Compare with a function of the file.
 
         A difference is relative to the norm of the output at the state, or to the RMS of the norms
         over all states if this is larger.
@@ -76,15 +78,15 @@ class ExportedFunction:
             RuntimeError: if a difference exceeds the tolerance.
         """
         states = [*zip(*self.inputs.values(), strict=True)]
-        pairs = []
-        for state in states:
-            with torch.no_grad():
-                expected = self.function(*state)
-            expected = (expected,) if isinstance(expected, Tensor) else expected
-            pairs.append((expected, call(*(x.numpy() for x in state))))
-        for k, output in enumerate(self.outputs):
-            values = np.stack([np.ravel(expected[k].numpy()) for expected, _ in pairs])
-            results = np.stack([np.ravel(result[k]) for _, result in pairs])
+        with torch.no_grad():
+            rows = [self.function(*state) for state in states]
+        outputs = [(row,) if isinstance(row, Tensor) else row for row in rows]
+        columns = call(*(x.numpy() for x in self.inputs.values()))
+        for output, expected, column in zip(
+            self.outputs, zip(*outputs, strict=True), columns, strict=True
+        ):
+            values = torch.stack(expected).reshape(len(states), -1).numpy()
+            results = np.reshape(column, values.shape)
             finite = np.isfinite(values).all(-1)
             norms = np.linalg.norm(values, axis=-1)
             scale = np.fmax(norms, np.sqrt(np.mean(norms[finite] ** 2)) if finite.any() else 0.0)
@@ -134,8 +136,9 @@ def write(
         )
         for function in functions if calls else ():
             function.compare(calls[function.name], TOLERANCES[real])
-        for file in Path(folder).iterdir():
-            os.replace(file, path.parent / file.name)
+        for file in (partial.with_suffix(".h"), partial):
+            if file.exists():
+                os.replace(file, path.parent / file.name)
     return path
 
 

@@ -34,6 +34,8 @@ _REDUCTIONS = {"sum": "ReduceSum", "amin": "ReduceMin", "amax": "ReduceMax"}
 def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, real: Real) -> Calls:
     """Write a function to an ONNX file of opset 18, whose inputs and outputs have its names.
 
+    Inputs and outputs have a batch dimension in front, ``(batch, *shape)``.
+
     ``metadata_props`` hold the fields of ``info``, and the SHA-256 of the graph.
 
     Raises:
@@ -69,11 +71,16 @@ def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, rea
             f"ONNX Runtime does not load {path.name} with {real} numbers: {error}: {remedy}"
         ) from error
 
-    def call(*arguments: np.ndarray) -> list[np.ndarray]:
-        values = [np.asarray(x, writer.dtype) for x in arguments]
+    def call(*inputs: np.ndarray) -> list[np.ndarray]:
+        values = [x.astype(writer.dtype) for x in inputs]
         return list(session.run(None, dict(zip(function.inputs, values, strict=True))))
 
     return {function.name: call}
+
+
+def _single(name: str) -> str:
+    """Return the name of an input or output in the graph of a state."""
+    return f"{name} of a state"
 
 
 class _Writer:
@@ -86,24 +93,32 @@ class _Writer:
         self.names: dict[fx.Node, Any] = {}
 
     def graph(self, function: ExportedFunction) -> Any:
+        """Return a graph that maps the graph of a state over a batch."""
         program = function.program
         placeholders = program.graph_module.graph.find_nodes(op="placeholder")
-        self.names = dict(zip(placeholders, program.inputs, strict=True))
+        self.names = dict(zip(placeholders, map(_single, program.inputs), strict=True))
         for node in program.graph_module.graph.nodes:
             if node.op == "get_attr":
                 self.names[node] = self.constant(node.meta["val"])
             elif node.op == "call_function":
                 self.names[node] = self._write(node)
         for name, node in zip(program.outputs, program.results(), strict=True):
-            self.node("Identity", [self.names[node]], name)
-        kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(self.dtype))
-        inputs, outputs = (
-            [self.helper.make_tensor_value_info(name, kind, list(n)) for name, n in shapes.items()]
-            for shapes in (program.inputs, program.outputs)
-        )
+            self.node("Identity", [self.names[node]], _single(name))
         used = {name for node in self.nodes for name in node.input}
         constants = [x for x in self.initializers.values() if x.name in used]
-        return self.helper.make_graph(self.nodes, function.name, inputs, outputs, constants)
+        shapes = (program.inputs, program.outputs)
+        ends = [[self.value(_single(x), y) for x, y in part.items()] for part in shapes]
+        state = self.helper.make_graph(self.nodes, "state", *ends, constants)
+        batches = [[self.value(x, ["batch", *y]) for x, y in part.items()] for part in shapes]
+        scan = self.helper.make_node(
+            "Scan", [*program.inputs], [*program.outputs], body=state, num_scan_inputs=len(ends[0])
+        )
+        return self.helper.make_graph([scan], function.name, *batches)
+
+    def value(self, name: str, shape: Sequence[int | str]) -> Any:
+        """Return the description of an input or output."""
+        kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(self.dtype))
+        return self.helper.make_tensor_value_info(name, kind, [*shape])
 
     def constant(self, value: Any, dtype: Any = None) -> str:
         """Return the name of a constant, stored once."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar, final
 
 import torch
@@ -29,12 +29,15 @@ class Predictor(nn.Module, abc.ABC):
         input_history: time before the start in which the model uses the input, s.
         past_steps: number n of earlier q that the model uses, a step apart, the latest first. x0
             ``(*batch, 2N + nN)`` holds them after the state; without them the robot was at rest.
+        labels, input_labels: name and unit of each coordinate and input, for files, if known.
     """
 
     fixed_step: float | None = None
     penalized: bool = False
     input_history: float = 0.0
     past_steps: int = 0
+    labels: Sequence[str] = ()
+    input_labels: Sequence[str] = ()
 
     def __init__(
         self, num_coordinates: PositiveInt, num_inputs: NonNegativeInt, state: State = "qv"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import logging
 import math
 import os
@@ -15,11 +16,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from pinn_dyn.exports.escaping import xml_comment
 from pinn_dyn.systems.inertia import central_parameters
 from pinn_dyn.systems.mjcf import exact_text
 from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
-from pinn_dyn.systems.urdf_file import UrdfFile
+from pinn_dyn.systems.urdf_file import UrdfFile, is_mjcf
 
 _MOMENTS = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
 _OF_MOVING_JOINTS = ("axis", "limit", "dynamics", "mimic", "calibration", "safety_controller")
@@ -70,7 +72,7 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
         mass, *numbers = bodies[robot.body_names.index(body)].tolist()
         if body != name:  # zero instead of nothing: MuJoCo would derive it from the shapes
             mass, numbers = 0.0, 9 * [0.0]
-            link.append(ET.Comment(f" in the inertia of {body} "))
+            link.append(ET.Comment(f" in the inertia of {xml_comment(body)} "))
         _remove(link, "inertial")
         inertial = ET.SubElement(link, "inertial")
         ET.SubElement(inertial, "origin", xyz=exact_text(numbers[:3]), rpy="0 0 0")
@@ -159,13 +161,13 @@ def _file(robot: RigidChain) -> UrdfFile:
     """Return the robot's file if it is the same as in the training, or else the stored text."""
     urdf = robot.urdf
     if urdf.startswith("<!-- "):  # a text of urdf_text
-        path = urdf[5:].partition(" -->")[0]
+        path = html.unescape(urdf[5:].partition(" -->")[0])
         try:
-            if urdf_text(path) == urdf:
+            if not is_mjcf(path) and urdf_text(path) == urdf:
                 return UrdfFile(path)
         except (OSError, ValueError):
             pass
-        log.warning("%s is missing or has changed: the export has no shapes", path)
+        log.warning("%s is missing, has changed or is an MJCF: no shapes are written", path)
     return UrdfFile(urdf)
 
 
@@ -175,7 +177,7 @@ def _remove(parent: ET.Element, *tags: str) -> None:
 
 
 def _written(root: ET.Element, notes: Iterable[str]) -> str:
-    lines = "".join(f"\n    {note.replace('--', '-')}" for note in notes)
+    lines = "".join(f"\n    {xml_comment(note)}" for note in notes)
     root.insert(0, ET.Comment(f"{lines}\n  "))
     ET.indent(root)
     return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'

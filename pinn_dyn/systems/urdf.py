@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pinn_dyn.exports.escaping import xml_comment
 from pinn_dyn.systems.urdf_file import TEXT, UrdfFile
 
 _UNREAD = {"visual", "collision", "material", "transmission", "gazebo"}
@@ -164,4 +165,4 @@ def urdf_text(urdf: str) -> str:
     text = ET.tostring(file.robot, encoding="unicode")
     text = ET.canonicalize(text, strip_text=True, exclude_tags=_UNREAD)
     name = str(file.path) if "<" in urdf else urdf
-    return f"<!-- {name.replace('--', '-')} -->{text}"
+    return f"<!-- {xml_comment(name)} -->{text}"

@@ -189,6 +189,14 @@ def is_text(urdf: str) -> bool:
     return urdf.lstrip("\ufeff \r\n\t").startswith("<")
 
 
+def is_mjcf(urdf: str) -> bool:
+    """Return true for the path or text of an MJCF, which only MuJoCo can read."""
+    try:
+        return _content(urdf)[1].tag == "mujoco"
+    except (OSError, ValueError):
+        return False
+
+
 def _ends(joint: ET.Element) -> tuple[str, str]:
     before, behind = joint.find("parent"), joint.find("child")
     names = ["" if end is None else end.get("link", "") for end in (before, behind)]
@@ -223,12 +231,7 @@ def _numbers(
 
 def _read(urdf: str) -> tuple[Path, ET.Element]:
     """Return the path and the ``<robot>`` of a URDF or MJCF."""
-    path, content = (Path(TEXT), urdf.encode()) if is_text(urdf) else _open(urdf)
-    try:
-        root = _parse(content)
-    except (ET.ParseError, LookupError, ValueError) as error:  # also unknown encodings
-        page = ": it is a web page" if b"<html" in content[:2000].lower() else ""
-        raise ValueError(f"{path} is not valid XML for a URDF: {error}{page}") from error
+    path, root = _content(urdf)
     if root.tag == "mujoco":
         root = ET.fromstring(mjcf_to_urdf(urdf if is_text(urdf) else path))
         path = Path("MJCF text") if is_text(urdf) else path
@@ -247,6 +250,16 @@ def _read(urdf: str) -> tuple[Path, ET.Element]:
         kind = "SDF" if root.tag == "sdf" else f"XML with the root <{root.tag}>"
         raise ValueError(f"{path} is {kind}, expected the URDF or the MJCF of the robot")
     return path, robot
+
+
+def _content(urdf: str) -> tuple[Path, ET.Element]:
+    """Return the path and the root of an XML file or text."""
+    path, content = (Path(TEXT), urdf.encode()) if is_text(urdf) else _open(urdf)
+    try:
+        return path, _parse(content)
+    except (ET.ParseError, LookupError, ValueError) as error:  # also unknown encodings
+        page = ": it is a web page" if b"<html" in content[:2000].lower() else ""
+        raise ValueError(f"{path} is not valid XML for a URDF: {error}{page}") from error
 
 
 def _open(urdf: str) -> tuple[Path, bytes]:

@@ -13,7 +13,8 @@ from PIL import Image
 import pinn_dyn
 from pinn_dyn.app.config import CONF
 from pinn_dyn.app.control import _guarded
-from pinn_dyn.control import DisturbanceObserver, Tracking
+from pinn_dyn.control import Tracking, export_law
+from pinn_dyn.exports.escaping import c_text
 from pinn_dyn.systems import RigidChain
 from tests.app.entry import (
     HIGH,
@@ -150,8 +151,8 @@ def test_the_learned_law_is_exported_with_its_limits_and_guard(
     header = path.with_suffix(".h").read_text()
     for part in (
         f"#define law_MEMORY_SIZE {size}",
-        '\\"period\\": 0.005',
-        '\\"fallback\\": \\"hold\\"',
+        c_text('"period": 0.005'),
+        c_text('"fallback": "hold"'),
     ):
         assert part in header
 
@@ -181,23 +182,26 @@ def test_the_guard_acts_and_is_exported_with_the_observer(tmp_path, lnn_run, und
     assert status == 2
 
 
+def test_a_law_on_the_model_of_a_run_has_the_names_of_its_joints(tmp_path, monkeypatch, lnn_run):
+    written = []
+    monkeypatch.setattr("pinn_dyn.control.export.write", lambda *given: written.append(given))
+    run = pinn_dyn.load(lnn_run)
+    export_law(Tracking(run.system, 1.0, 1.0), tmp_path / "law.c")
+    assert written[0][2]["q"] == run.labels
+    assert written[0][2]["u"] == run.input_labels
+
+
 def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
     tmp_path, monkeypatch, lnn_run, undrawn
 ):
     written = []
     monkeypatch.setattr("pinn_dyn.control.export.write", lambda *given: written.append(given))
-    monkeypatch.setattr(
-        "pinn_dyn.control.export._export_package", lambda *given, **_: written.append(given)
-    )
     words = ["rate=200", "~controllers.pd", "~controllers.truth", "duration=0.1", "settled_after=0"]
     words += ["controllers=tracking", "exported_law=learned_observer", "export_real=float"]
-    for ending in ("c", "pt2"):
-        control(tmp_path / ending, lnn_run, f"export={tmp_path}/law.{ending}", *words)
-    ((law,), path, info, real), package = written
+    control(tmp_path / "c", lnn_run, f"export={tmp_path}/law.c", *words)
+    (((law,), path, info, real),) = written
     assert (law.name, path.name, real) == ("control", "law.c", "float")
     assert info["observer"] == {"bandwidth": 200.0}
-    assert package[1].suffix == ".pt2"
-    assert isinstance(package[0], DisturbanceObserver)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pinn_dyn.app.run_folder import load_run
+from pinn_dyn.systems import RigidChain, robot_files
 from tests.support.foreign_runs import foreign
 from tests.support.simulated_arms import PENDULUM, SIMULATORS, simulated_by
 
@@ -40,6 +41,41 @@ def test_no_simulator_is_started_for_a_run_folder(tmp_path, lnn_run, monkeypatch
             load_run(run).source.load()
     trusted = load_run(run, trust=(target,)).source.load()
     assert len(load_run(run).source.load().train) == len(trusted.train)  # from the cache
+
+
+ENDLESS = '<mujoco><worldbody><replicate count="1000000000"><geom size="1"/></replicate>'
+ENDLESS += '<body><joint name="a"/><geom size="1"/></body></worldbody></mujoco>'
+
+
+@pytest.fixture
+def unread(monkeypatch):
+    """MuJoCo reads no file."""
+    text = "pinn_dyn.systems.urdf_file.mjcf_to_urdf"
+    monkeypatch.setattr(text, lambda *_: pytest.fail("MuJoCo was started"))
+
+
+@pytest.mark.usefixtures("unread")
+@pytest.mark.parametrize("encoding", [None, "utf-8", "utf-16"])
+def test_no_mjcf_of_a_run_folder_is_read(tmp_path, lnn_run, encoding):
+    """As text, or as a file that the configuration names."""
+    file = tmp_path / "robot.xml"
+    file.write_bytes(f" {ENDLESS}".encode(encoding or "utf-8"))
+    structure = {
+        "_target_": "pinn_dyn.systems.RigidChain",
+        "urdf": str(file) if encoding else f" \n{ENDLESS}",
+    }
+    model = {"_target_": "pinn_dyn.models.KnownMechanics", "structure": structure}
+    run = foreign(lnn_run, tmp_path / "run", lambda config: config.update(model=model))
+    message = r"model\.structure\.urdf is an MJCF, .*add trust=pinn_dyn\.systems\.RigidChain"
+    with pytest.raises(ValueError, match=message):
+        load_run(run)
+
+
+@pytest.mark.usefixtures("unread")
+def test_an_export_reads_no_mjcf_that_the_urdf_of_a_run_names(tmp_path):
+    (tmp_path / "robot.xml").write_text(ENDLESS)
+    arm = RigidChain(f"<!-- {tmp_path}/robot.xml -->{PENDULUM[PENDULUM.index('<robot') :]}")
+    assert str(robot_files._file(arm).path) == "URDF text"
 
 
 @pytest.mark.parametrize("simulator", SIMULATORS)

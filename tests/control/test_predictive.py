@@ -211,6 +211,38 @@ def test_continuous_time_is_refused(law):
         close_loop_continuous(Pendulum(), law, SetPoint([1.0]), *start, **settings)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("k", [0, 1])
+def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
+    law = PredictiveControl(Pendulum(), 0.6, STEP, observer_bandwidth=5.0)
+    goal = SetPoint([1.0])(0.0)
+    states = [double([[0.1]]), double([[0.0]])]
+    first = law(0.0, *states, goal)
+    broken = [x + bad if i == k else x for i, x in enumerate(states)]
+    assert torch.equal(law(STEP, *broken, goal), first)
+    assert law.diagnostics()["solver_failed"].tolist() == [1.0]
+    after = law(2 * STEP, *states, goal)
+    assert law.diagnostics()["solver_failed"].tolist() == [0.0]
+    assert after.isfinite().all()
+    law.reset()
+    assert not law(0.0, *broken, goal).any()  # nothing was applied before
+
+
+def test_times_limits_and_references_that_are_not_numbers_are_named(law):
+    law.reset()
+    state, goal = [double([[0.1]]), double([[0.0]])], SetPoint([1.0])(0.0)
+    with pytest.raises(ValueError, match="t is nan, expected the time of the call in s"):
+        law(np.nan, *state, goal)
+    with pytest.raises(ValueError, match=r"the reference of v\[0\] at 0 s is not finite"):
+        law(0.0, *state, goal._replace(v=double([np.nan])))
+    for name in ("q_low", "v_max", "position_weight"):
+        with pytest.raises(ValueError, match=rf"{name} is nan, expected 1 or 1 numbers"):
+            PredictiveControl(Pendulum(), 0.6, STEP, **{name: np.nan})
+    with pytest.raises(ValueError, match="low nan and high None, expected low <= high"):
+        Actuator(low=np.nan)
+    law.reset()
+
+
 def test_values_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match="v_max is"):
         PredictiveControl(Pendulum(), 0.6, STEP, v_max=[1.0, 2.0])

@@ -14,7 +14,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from pinn_dyn import check
-from pinn_dyn.data.simulation import has_cpp_compiler
+from pinn_dyn.exports.c_file import find_compiler
 from tests.app.entry import ROOT, compose, own_logging
 
 EXAMPLES = ROOT / "examples"
@@ -88,8 +88,7 @@ def test_the_example_log_determines_a_model_that_controls(home):
     assert "largest distance" in run("torque_feedforward.py", "runs/whole")
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not has_cpp_compiler(), reason="an export needs a C++ compiler")
+@pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
 def test_export_and_call(own_log):
     assert "the same as before the export: True" in run("export_and_call.py", RUN)
 

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import subprocess
 
 import numpy as np
@@ -81,6 +82,26 @@ def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
     assert_refused(tmp_path, r"cc does not compile f\.c: .*error")
 
 
+@pytest.mark.parametrize(
+    ("code", "end"), [("{0}; for (;;)", "timed out"), ("*(volatile real *)0 * {0}", "SIGSEGV")]
+)
+def test_code_that_does_not_return_ends_with_a_message(tmp_path, monkeypatch, code, end):
+    monkeypatch.setattr("pinn_dyn.exports.c_code._ELEMENTWISE", {"sin": code})
+    monkeypatch.setattr("pinn_dyn.exports.c_file.TIME_LIMIT", 0.5)
+    assert_refused(tmp_path, rf"sine cannot be compared: .*{end}")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_number_that_is_not_finite_differs_from_every_number(value):
+    """On either side: in the file, or in the original."""
+    with pytest.raises(RuntimeError, match="sine: y differs from the original"):
+        SINE.compare(lambda x: [np.full((200, 1), value)], 1e9)
+    broken = ExportedFunction("broken", lambda x: value * x, SINE.inputs, "y")
+    with pytest.raises(RuntimeError, match="broken: y differs from the original"):
+        broken.compare(lambda x: [x], 1e9)
+    broken.compare(lambda x: [value * x], 1e-9)
+
+
 def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
     tmp_path, monkeypatch, caplog
 ):
@@ -122,6 +143,31 @@ def test_the_compiler_sees_wrong_sizes_and_the_caller_the_version(tmp_path):
     info = json.loads(text)
     assert info["q"][1] == 'a "quoted" µ'
     assert (len(info["sha256"]), info["model"]) == (64, "AccelerationMLP")
+
+
+def test_powers_are_powers_and_constants_of_floats_are_floats(tmp_path):
+    """A constant without f would make the compiler compute with doubles."""
+    function = lambda x: 0.1 * torch.cat([x**3, x**2, x.abs() ** 0.5, x.exp() ** -1.5])  # noqa: E731
+    powers = ExportedFunction("powers", function, SINE.inputs, "y")
+    write([powers], tmp_path / "f.c", {})
+    path = write([powers], tmp_path / "f.c", {}, "float")
+    command = ["cc", *STRICT, "-Wdouble-promotion", "-c", path.name, "-o", "f.o"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_the_stack_of_the_header_suffices(tmp_path, real):
+    model = MODELS[CONSTANT]().double().eval().requires_grad_(False)
+    path = export(model, tmp_path / "arm.c", real=real)
+    header = path.with_suffix(".h").read_text()
+    stated = re.findall(r"Stack: at most (\d+) bytes. \*/\n\w+ (\w+)\(", header)
+    for level in ("-O1", "-O3"):
+        command = ["gcc", *STRICT, level, "-fstack-usage", "-c", path.name]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        lines = (tmp_path / "arm.su").read_text().splitlines()
+        sizes = {line.split(":")[-1].split()[0]: int(line.split("\t")[1]) for line in lines}
+        assert len(stated) == 4
+        assert all(sizes[name] <= int(size) for size, name in stated)
 
 
 # Operations that the models of this package do not use.

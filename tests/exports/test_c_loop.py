@@ -52,7 +52,8 @@ def rolled_out(model, batch=(), count=80, interpolation="linear", scale=1.0):
     n, m = model.num_coordinates, model.num_inputs
     x0 = 0.3 * scale * torch.randn(*batch, 2 * n, generator=generator).double()
     u = scale * torch.randn(*batch, count + 5, m, generator=generator).double()
-    t = 0.004 * torch.arange(count + 5).double()
+    k = torch.arange(count + 5).double()
+    t = 0.004 * k + 0.001 * k.sin()  # steps of different lengths
     signal = Signal(t, u, interpolation)
     with torch.no_grad():
         found = model_for_rollouts(model).predict(x0, t[5:], signal)

@@ -24,8 +24,8 @@ def session_of(path):
 @pytest.mark.parametrize("real", ["double", "float"])
 def test_the_files_of_black_boxes_repeat_them(real, tmp_path):
     model = MODELS["acceleration"]().double().eval().requires_grad_(False)
-    q, v, a, u = (x[0] for x in random_batch(model.num_coordinates, model.num_inputs, 1, seed=11))
-    h = torch.tensor(2e-3).double()
+    q, v, a, u = random_batch(model.num_coordinates, model.num_inputs, 3, seed=11)
+    h = torch.tensor([2e-3, 1e-3, 0.0]).double()
     dtype, tolerance = (np.float64, 1e-9) if real == "double" else (np.float32, 1e-4)
     for function in model_functions(model):
         path = export(model, tmp_path / f"{function.name}.onnx", function.name, real=real)
@@ -34,9 +34,10 @@ def test_the_files_of_black_boxes_repeat_them(real, tmp_path):
         session = session_of(path)
         assert [x.name for x in session.get_outputs()] == list(function.outputs)
         results = session.run(None, {name: x.numpy().astype(dtype) for name, x in values.items()})
-        expected = function.function(*values.values())
-        expected = [expected] if isinstance(expected, torch.Tensor) else expected
-        for x, y in zip(results, expected, strict=True):
+        rows = [function.function(*state) for state in zip(*values.values(), strict=True)]
+        rows = [[row] if isinstance(row, torch.Tensor) else row for row in rows]
+        for x, *parts in zip(results, *rows, strict=True):
+            y = torch.stack(parts)
             assert (x.shape, x.dtype) == (tuple(y.shape), dtype)
             np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * float(y.abs().max()))
 
@@ -48,16 +49,16 @@ def test_a_law_keeps_its_memory_between_calls_and_says_what_it_is(tmp_path):
     path = export_law(
         law, tmp_path / "law.onnx", actuator=Actuator(rate=20.0), period=0.01, about=about
     )
-    session, actuator, memory = session_of(path), Actuator(rate=20.0), np.zeros(3)
+    session, actuator, memory = session_of(path), Actuator(rate=20.0), np.zeros((1, 3))
     names = [x.name for x in session.get_inputs()]
     assert names == ["q", "v", "q_ref", "v_ref", "a_ref", "memory_in"]
     for k in range(10):
         state = [torch.sin(k + torch.arange(3.0).double() + i) for i in range(5)]
-        inputs = dict(zip(names, [*(x.numpy() for x in state), memory], strict=True))
+        inputs = dict(zip(names, [*(x.numpy()[None] for x in state), memory], strict=True))
         u, status, memory = session.run(["u", "status", "memory_out"], inputs)
         expected, changed = actuator(law.law(*state), 0.01)
-        np.testing.assert_allclose(u, expected.detach(), rtol=1e-9)
-        assert status == int(changed.any())
+        np.testing.assert_allclose(u[0], expected.detach(), rtol=1e-9)
+        assert status == [int(changed.any())]
     fields = {item.key: item.value for item in onnx.load(path).metadata_props}
     assert json.loads(fields["q"]) == about["q"]
     assert json.loads(fields["position_gain"]) == [3.0] * 3

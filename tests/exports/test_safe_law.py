@@ -16,6 +16,7 @@ from pinn_dyn.control import (
     export_law,
 )
 from pinn_dyn.control.region import FallBack
+from pinn_dyn.control.safe_law import SafeLaw
 from pinn_dyn.mechanics import InputSolver
 from pinn_dyn.systems import TendonArm
 from tests.models.builders import VARIANTS, make_structured
@@ -101,7 +102,8 @@ def test_casadi_and_onnx_files_guard_against_far_and_missing_measurements(law, t
     names = [item.name for item in session.get_inputs()]
     for state, expected_status in ((near, 0), (far, 2), (missing, 4)):
         values = [*state, np.full(3, 0.2)]
-        for call in (function.call, lambda x: session.run(None, dict(zip(names, x, strict=True)))):
+        batch = {name: x[None] for name, x in zip(names, values, strict=True)}
+        for call in (function.call, lambda _, batch=batch: session.run(None, batch)):
             u, status, _ = (np.array(x).ravel() for x in call(values))
             good = law.law(*map(torch.from_numpy, state))
             expected = values[-1] if expected_status else good
@@ -132,6 +134,18 @@ def test_numbers_that_are_not_finite_give_the_last_input(law, tmp_path):
     u, status = control(*good)
     assert np.isfinite(u).all()
     assert not status & 4
+
+
+@pytest.mark.parametrize("bad", [[-np.inf, 0, 0], [np.inf, -np.inf, 0], [0, np.nan, 0]])
+def test_an_input_that_is_not_finite_gives_the_last_whatever_its_sum(law, monkeypatch, bad):
+    """The sum of minus infinity is less than every number."""
+    safe = SafeLaw(law)
+    u, last = torch.tensor(bad).double(), torch.tensor([1.0, 2.0, 3.0]).double()
+    monkeypatch.setattr(law, "law", lambda *state: u)
+    result, status, memory = safe(*[torch.zeros(3).double()] * 5, last)
+    assert status == 4
+    assert torch.equal(result, last)
+    assert torch.equal(memory, last)
 
 
 def test_a_held_input_does_not_spoil_the_memory_of_the_observer(law, tmp_path):
@@ -180,8 +194,8 @@ def test_what_a_file_cannot_hold_is_refused(law, tmp_path, caplog):
             export_law(controller, tmp_path / "law.c", **options)
     with pytest.raises(ValueError, match=r"ends in '.so', expected one of .c, .onnx"):
         export_law(law, tmp_path / "law.so")
-    with pytest.raises(TypeError, match="DisturbanceObserver has a memory: export it to"):
-        export_law(DisturbanceObserver(law, 20.0), tmp_path / "law.pt2")
+    with pytest.raises(ValueError, match=r"ends in '.pt2', expected one of .c, "):
+        export_law(law, tmp_path / "law.pt2")
     assert not list(tmp_path.iterdir())
 
 

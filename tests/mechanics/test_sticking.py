@@ -158,6 +158,14 @@ def test_a_strongly_damped_mass_comes_to_rest_and_stays_there():
     assert not pushed(50.0, Rosenbrock, 0.1, [0.0] * 3, v0=0.09)[1:, 1].any()
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_mass_that_turns_within_a_step_moves_back_for_the_rest_of_it(method):
+    """The force of -3 N stops it after 25 ms of 0.1 s, against friction of 1 N."""
+    q, v = pushed(0.0, method, 0.1, [-3.0, -3.0], v0=0.1)[1]
+    assert float(v) == pytest.approx(-2.0 * 0.075)
+    assert float(q) == pytest.approx(0.1 * 0.025 / 2 - 2.0 * 0.075**2 / 2)
+
+
 def test_a_stopped_mass_is_held_by_the_friction_at_rest():
     """The load of 1.5 N is above the sliding friction of 1 N, and below the stiction of 2 N."""
 

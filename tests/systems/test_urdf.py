@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pinn_dyn.systems import RigidChain
+from pinn_dyn.systems import RigidChain, robot_files
 from pinn_dyn.systems.urdf import read_urdf, urdf_text
 from tests.attacks.damage import byte_hits, hit, places
 from tests.support.arm_urdf import ARM, changed
@@ -36,6 +36,14 @@ def joint(name, parent, child):
 )
 def test_an_odd_urdf_may_be_right(old, new):
     assert read_urdf(changed((old, new))).joints == ["shoulder", "elbow"]
+
+
+def test_a_path_of_any_characters_is_found_again_behind_the_text_of_a_run(tmp_path):
+    """Two hyphens would end the comment that holds it."""
+    file = tmp_path / "a--b -->[é]<robot/>.urdf".replace("/", "_")
+    file.write_text(ARM)
+    arm = RigidChain(urdf_text(str(file)))
+    assert robot_files._file(arm).path == file
 
 
 def test_the_links_may_come_in_any_order_and_an_axis_may_have_any_length():
