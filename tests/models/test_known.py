@@ -30,7 +30,7 @@ class TestKnownMechanicsContract(MechanicalSystemContract):
 
     @pytest.fixture
     def system(self):
-        model = known_model(friction=None, gain_spread=0.5, drive_gain=2.0)
+        model = known_model(friction=None, gain_spread=0.5, drive_gain=2.0, springs=["bend"])
         return anywhere(model, std=0.2)
 
 
@@ -41,6 +41,22 @@ def test_the_prior_start_is_the_urdfs_robot():
     drives = model.armature() * a + model.viscous() * v - model.offset()
     expected = chain.inverse_dynamics(q, v, a) + drives
     assert torch.allclose(model.inverse_dynamics(q, v, a), expected, rtol=1e-5, atol=1e-4)
+
+
+def test_springs_store_half_k_times_the_square_of_their_stretch():
+    plain, model = known_model(), anywhere(known_model(springs=["slide", "bend"]))
+    with torch.no_grad():
+        model.bodies.z.copy_(plain.bodies.z)
+        model.offset.z.copy_(plain.offset.z[[0, 3]])  # of the other joints
+        q = torch.randn(20, 4).double()
+        energy = model.potential_energy(q) - plain.potential_energy(q)
+        stiffness, rest = (part.values for part in model.physical_constants()[-2:])
+    assert model.physical_constants()[-1].names == ["rest position of slide", "rest angle of bend"]
+    assert model.physical_constants()[-2].units == ["N/m", "Nm/rad"]
+    expected = (0.5 * stiffness * (q[:, [1, 2]] - rest) ** 2).sum(-1)
+    torch.testing.assert_close(energy - energy[0], expected - expected[0])
+    with pytest.raises(ValueError, match=r"springs names knee, expected some of turn, slide"):
+        known_model(springs=["knee"])
 
 
 def test_the_generic_start_ignores_the_urdfs_inertias():
