@@ -30,7 +30,9 @@ def table_of(arms: Arms, q: np.ndarray, u: np.ndarray, arm: int) -> pd.DataFrame
     stride = max(round(0.02 * rate), 1)
     windows = draw_windows(runs, count=150, steps=10, stride=stride, seed=arm)
     chain = RigidChain(arms.urdf(arm))
-    model = KnownMechanics(windows.statistics(), chain, friction=CoulombFriction).double()
+    model = KnownMechanics(
+        windows.statistics(), chain, start="generic", friction=CoulombFriction
+    ).double()
     model.structure = RigidChain(arms.urdf(arm))
     fit = LeastSquares(cutoff=6.0, rollouts=False).fit(model, runs)
     table = constants_table(model, fit)

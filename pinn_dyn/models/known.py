@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, Protocol, runtime_checkable
 
@@ -26,6 +26,7 @@ from pinn_dyn.models.structured import FrictionHead
 
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the ten inertial parameters of a body."""
+_GENERIC_SPREAD = 3.0
 
 
 @runtime_checkable
@@ -80,10 +81,13 @@ class KnownMechanics(LearnedConstants):
     Args:
         statistics: scales of the data.
         structure: the kinematics, such as a :class:`~pinn_dyn.systems.RigidChain`.
-        start: ``"generic"`` starts from rods along the links, ``"prior"`` from the bodies of the
-            description, which are the ground truth for a simulated robot.
+        start: ``"prior"`` starts from the bodies of the description, which are the ground truth for
+            a simulated robot, and from generic ones for bodies that cannot exist; ``"generic"``
+            starts from rods along the links.
         spread: prior standard deviation of the bodies, see :class:`PhysicalBodies`: 0.3 for a data
-            sheet, 3 for generic bodies (with 1 their intervals are too narrow).
+            sheet, 3 for generic bodies (with 1 their intervals are too narrow). A mapping has names
+            of bodies, and ``default`` for all others. Generic bodies for ones that cannot exist
+            have at least 3.
         friction: builder of the dry friction.
         drive_gain: initial k, one number or M. It is learned if ``gain_spread`` is positive.
         gain_spread: prior standard deviation of log k; 0 if the input is a torque.
@@ -95,15 +99,15 @@ class KnownMechanics(LearnedConstants):
 
     Raises:
         ValueError: if the structure has no rigid bodies or other joints than the data or the
-            springs, or a body is not physical.
+            springs, or ``spread`` names other bodies.
     """
 
     def __init__(
         self,
         statistics: Statistics,
         structure: Structure,
-        start: Literal["generic", "prior"] = "generic",
-        spread: PositiveFloat = 3.0,
+        start: Literal["generic", "prior"] = "prior",
+        spread: PositiveFloat | Mapping[str, PositiveFloat] = _GENERIC_SPREAD,
         friction: FrictionHead = NoFriction,
         drive_gain: PositiveFloat | Sequence[PositiveFloat] = 1.0,
         gain_spread: NonNegativeFloat = 0.0,
@@ -135,15 +139,20 @@ class KnownMechanics(LearnedConstants):
             raise ValueError(f"springs names {', '.join(unknown)}, expected some of {expected}")
         super().__init__(size, statistics.num_inputs)
         self.structure = structure
-        # Rods for the links of an arm. The last body has no link, so a single rod has no size.
-        generic = 100.0 if len(driven) > 1 else math.inf
-        self._largest_ratio = 5.0 if start == "prior" else generic
         self.driven = [names.index(name) for name in driven]
         gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
         acceleration = statistics.acceleration.double()
         joints = tuple(map(Joint, names, structure.turning))
-        bodies = structure.generic_inertia() if start == "generic" else structure.prior_inertia()
-        self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
+        generic = structure.generic_inertia()
+        bodies = structure.prior_inertia() if start == "prior" else generic
+        spreads = _spreads(spread, structure.body_names)
+        if start == "prior":
+            guessed = (bodies == generic).flatten(1).all(1)
+            spreads = torch.where(guessed, spreads.clamp(min=_GENERIC_SPREAD), spreads)
+        self.bodies = PhysicalBodies(bodies, spreads, structure.body_names)
+        # Rods for the links of an arm. The last body has no link, so a single rod has no size.
+        largest = 100.0 if len(driven) > 1 else math.inf
+        self._largest_ratio = 5.0 if spreads.median() <= 1 else largest
         drives = None if input else gain * statistics.u_rms.double()
         force = self._typical_forces(statistics, bodies, drives)
         scales = Scales(statistics, force, named=joints, prior=True)
@@ -345,3 +354,15 @@ class KnownMechanics(LearnedConstants):
 
     def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
         return self.friction.sliding(v, share)
+
+
+def _spreads(spread: float | Mapping[str, float], bodies: Sequence[str]) -> Tensor:
+    """Return the prior standard deviation of each body, ``(n,)``."""
+    by_name = spread if isinstance(spread, Mapping) else {"default": spread}
+    if unknown := set(by_name) - {"default", *bodies}:
+        raise ValueError(
+            f"spread names {', '.join(unknown)}, expected default and some of the bodies "
+            f"{', '.join(bodies)}"
+        )
+    default = by_name.get("default", _GENERIC_SPREAD)
+    return torch.tensor([by_name.get(name, default) for name in bodies], dtype=torch.float64)

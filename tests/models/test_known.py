@@ -116,6 +116,33 @@ def test_a_body_that_cannot_be_is_named():
         PhysicalBodies(impossible, 1.0, chain.body_names)
 
 
+def test_the_bodies_of_the_file_are_the_start_and_generic_ones_have_a_wide_prior():
+    """By the default, and with another spread for one of the bodies."""
+    text = TREE.replace('mass value="0.7"', 'mass value="-0.7"')
+    chain = RigidChain(text, locked_joints=["wrist"])
+    spread = {"default": 0.3, "elbow": 2.0}
+    model = KnownMechanics(statistics(4), chain, spread=spread)
+    prior, generic = chain.prior_inertia(), chain.generic_inertia()
+    start = model.bodies.start().double()
+    assert chain.body_names[:3] == ["shoulder", "slider", "elbow"]
+    torch.testing.assert_close(start[1], generic[1], rtol=1e-5, atol=1e-6)
+    for k in (0, 2, 3):
+        torch.testing.assert_close(start[k], chain.inertia[k].double(), rtol=1e-5, atol=1e-6)
+    assert torch.equal(prior[1], generic[1].to(prior))
+    assert model.bodies.spread.flatten().tolist() == pytest.approx([0.3, 3.0, 2.0, 0.3])
+    with pytest.raises(ValueError, match=r"spread names arm, expected default .* shoulder, slider"):
+        KnownMechanics(statistics(4), chain, spread={"arm": 1.0})
+
+
+def test_a_checkpoint_of_an_earlier_version_has_the_same_spread_for_all_bodies():
+    chain = RigidChain(TREE.replace("0.7", "-0.7"))
+    model = KnownMechanics(statistics(5), chain, spread=0.5)
+    state = model.state_dict()
+    del state["bodies.spread"]
+    model.load_state_dict(state)
+    assert model.bodies.spread.unique().tolist() == [0.5]
+
+
 def test_standardized_constants():
     positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"], ["kg", "kg"])
     real = RealConstants(torch.tensor([4.0]), ["c"], ["N"])
@@ -161,5 +188,5 @@ def test_the_ratio_of_forces_counts_per_input():
         model.gain.z.fill_(math.log(0.5) / 0.7)
         torch.testing.assert_close(model.force_ratio(q, v, a)[0], 2 * ratio)
         mass = math.log(0.5) / 2 / model.bodies.spread
-        model.bodies.z[:, 0] = mass
+        model.bodies.z[:, :1] = mass
         torch.testing.assert_close(model.force_ratio(q, v, a)[0], ratio, rtol=1e-5, atol=0)
