@@ -141,7 +141,8 @@ def test_motions_leave_open_what_the_check_of_a_log_names(model, tmp_path):
         lines = [line[2:] for line in text.splitlines() if line.startswith("- ")]
         assert ("; ".join(lines) or "none") == excitation.undetermined
         assert text.startswith(f"{len(lines)} of {excitation.count} base parameters")
-        assert f"Move {', '.join(excitation.open_joints)} at more" in text
+        move = f"Move {', '.join(excitation.open_joints)} at more"
+        assert (move in text) == bool(lines)
         counts.append(len(lines))
         assert "per drive gain only" in text
     assert counts[0] < counts[1]
