@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
 from pinn_dyn.systems import HasDomain, RigidChain
 from pinn_dyn.systems.robot_files import RobotConstants, new_mjcf, updated_urdf
+
+log = logging.getLogger(__name__)
 
 _WRITERS = {".urdf": updated_urdf, ".xml": new_mjcf}
 _BODY_COLUMNS = 10  # of physical_constants
@@ -113,10 +116,15 @@ def _export_robot(model: Predictor, path: Path) -> Path:
     if path.suffix == ".xml" and (model.elastic or model.num_inputs > len(model.driven)):
         kind = "elastic joints" if model.elastic else "feed-forward forces"
         raise ValueError(f"{path}: {kind} have no actuator of an MJCF, use the ending .urdf")
+    if path.suffix == ".urdf" and model.springs is not None:
+        log.warning("%s: a URDF has no springs of joints, they are in a comment; use .xml", path)
     model = double_copy(model)
     chain = chain.double()
     with torch.no_grad():
-        servo, offset = model.servo, model.constant_force()
+        servo, offset = model.servo, model.offset() @ model.offset_joints
+        stiffness, rest = 2 * [0 * offset]
+        if model.springs is not None:
+            stiffness, rest = model.springs.springs(), model.springs.rest_positions()
         limit = torch.full_like(offset, torch.inf)
         if servo and not servo.affine:
             limit[model.driven] = servo.largest_force()
@@ -131,6 +139,8 @@ def _export_robot(model: Predictor, path: Path) -> Path:
             gain=springs if servo else model.input_gain() @ model.motors,
             bias=torch.stack([offset, -springs, -damping], dim=-1),
             limit=limit,
+            stiffness=stiffness,
+            rest=rest,
             notes=[
                 f"Inertias, damping and friction identified by pinn_dyn {__version__}. Drives:",
                 *(

@@ -40,8 +40,8 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
     if not isinstance(structure, RigidChain):
         return model, {}
     matched = match_structure(structure, source)
-    if settings.get("start") == "prior" and structure.tree.problems:
-        log.warning("start=prior: %s", "; ".join(structure.tree.problems))
+    if settings.get("start", "prior") == "prior":
+        _log_bodies(matched)
     changes: dict[str, Any] = {"structure": {"joints": matched.joints}}
     names = list(driven or matched.joint_names)
     key, units = _signals(source)[-1]
@@ -55,6 +55,17 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
         changes["driven_joints"] = driven = inputs
     settings = {"structure": matched} | ({} if driven is None else {"driven_joints": driven})
     return partial(model, **settings), changes
+
+
+def _log_bodies(structure: RigidChain) -> None:
+    """Name the bodies of the description that a fit does not start from."""
+    same = (structure.prior_inertia() == structure.generic_inertia()).flatten(1).all(1).tolist()
+    names = [name for name, generic in zip(structure.body_names, same, strict=True) if generic]
+    if names:
+        text = "<inertial> of %s is missing or impossible: the fit starts from rods along the links"
+        log.info(text, ", ".join(names))
+    if structure.tree.problems:
+        log.warning("start=prior: %s", "; ".join(structure.tree.problems))
 
 
 def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:

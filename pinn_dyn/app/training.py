@@ -465,7 +465,9 @@ def _fit(
         raise KeyboardInterrupt from stop
     if solver and solver.result is not None:
         recorder.facts["stage"] = solver.result.stage
-        write_constants(learner.model, solver.result, source, folder)
+        assert isinstance(data, DynamicsData)
+        runs, cutoff = data.splits.train, solver.solver.cutoff
+        write_constants(learner.model, solver.result, source, folder, runs, cutoff)
     # Other processes have counted the steps of theirs.
     record = recorder.record(trainer, learner.model, read_checkpoint(last)["global_step"])
     finish(folder, record)

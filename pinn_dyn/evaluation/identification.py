@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,7 +14,8 @@ from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.mechanics import double_copy
-from pinn_dyn.models.known_constants import Named
+from pinn_dyn.models.known import KnownMechanics
+from pinn_dyn.models.known_constants import Named, PositiveConstants
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.training.constants_fit import Fit, posterior_covariance
 
@@ -21,6 +23,7 @@ COLUMNS = ["name", "value", "low", "high", "unit", "start", "known"]
 """Columns of the table of constants."""
 OPEN = 0.5
 """Part of the prior variance above which a constant or direction is not determined."""
+_CONFLICT = 3.0  # prior standard deviations
 
 
 class Direction(NamedTuple):
@@ -122,6 +125,36 @@ def undetermined(model: LearnedConstants, fit: Fit) -> list[str]:
         variance = item.direction @ fit.covariance.numpy() @ item.direction
         lines.append(f"{item.text}: held by the prior ({variance:.0%} of its variance is left)")
     return lines
+
+
+def contradicted(model: LearnedConstants, fit: Fit) -> list[str]:
+    """Describe the bodies and gains that a first fit moves by over 3 prior standard deviations."""
+    if not isinstance(model, KnownMechanics) or fit.prior.mean.any():
+        return []
+    default = float(model.bodies.spread.min())
+    wider = f"correct its <inertial>, or set 'model.spread={{{{default: {default:g}, {{0}}: 3}}}}'"
+    remedies = {model.bodies: wider, model.gain: "correct model.drive_gain, or raise gain_spread"}
+    lines = []
+    for part, remedy in remedies.items():
+        far: dict[str, list[str]] = {}
+        for name, z in zip(part.names, part.z.flatten().tolist(), strict=True) if part else ():
+            label, owner = name.split(" of ", 1)
+            if abs(z) > _CONFLICT:
+                far.setdefault(owner, []).append(f"{label} by {abs(z):.1f}")
+        for owner, texts in far.items():
+            moved = (
+                f"the data move {owner} far from its prior, {', '.join(texts)} standard deviations"
+            )
+            lines.append(f"{moved}: {remedy.format(owner)}")
+    return lines
+
+
+def common_factor(model: KnownMechanics, fit: Fit) -> float:
+    """Return the factor by which the 95 % interval of all drive gains together extends."""
+    assert isinstance(model.gain, PositiveConstants)
+    index = [model.parameter_names().index(name) for name in model.gain.names]
+    deviation = model.gain.spread * float(fit.covariance[index][:, index].mean()) ** 0.5
+    return math.exp(1.96 * deviation)
 
 
 def named_directions(space: np.ndarray, names: Sequence[str]) -> list[Direction]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, Protocol, runtime_checkable
 
@@ -15,6 +15,7 @@ from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.elastic import ElasticJoints, Springs
 from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.joint_springs import JointSprings
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants
@@ -25,6 +26,7 @@ from pinn_dyn.models.structured import FrictionHead
 
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the ten inertial parameters of a body."""
+_GENERIC_SPREAD = 3.0
 
 
 @runtime_checkable
@@ -60,11 +62,12 @@ class Structure(Protocol):
 class KnownMechanics(LearnedConstants):
     """Rigid bodies with known kinematics and drives, and learned constants::
 
-        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = A u
+        (M(q) + diag(r)) a + C(q, v) v + G(q) + k_s (q - q_0) - o + D v + F(v) = A u
 
     M, C and G are those of the ``structure`` with learned pseudo-inertias. r is the armature
     (inertia of the rotors at the joint), o a constant torque, D = diag(d) viscous friction and F
-    dry friction. A ``(N, M)`` is diag(k) without the columns of passive joints, which have friction
+    dry friction. k_s and q_0 are the stiffness and the rest position of ``springs``, which have no
+    o besides. A ``(N, M)`` is diag(k) without the columns of passive joints, which have friction
     but no armature and no constant torque. k are the drive gains from the input to the torque, such
     as in Nm/A. Bodies have a positive density, and r, d, k > 0 for all values of the parameters,
     which are standard normal a priori (:mod:`.known_constants`). Scales come from the data: with
@@ -78,10 +81,13 @@ class KnownMechanics(LearnedConstants):
     Args:
         statistics: scales of the data.
         structure: the kinematics, such as a :class:`~pinn_dyn.systems.RigidChain`.
-        start: ``"generic"`` starts from rods along the links, ``"prior"`` from the bodies of the
-            description, which are the ground truth for a simulated robot.
+        start: ``"prior"`` starts from the bodies of the description, which are the ground truth for
+            a simulated robot, and from generic ones for bodies that cannot exist; ``"generic"``
+            starts from rods along the links.
         spread: prior standard deviation of the bodies, see :class:`PhysicalBodies`: 0.3 for a data
-            sheet, 3 for generic bodies (with 1 their intervals are too narrow).
+            sheet, 3 for generic bodies (with 1 their intervals are too narrow). A mapping has names
+            of bodies, and ``default`` for all others. Generic bodies for ones that cannot exist
+            have at least 3.
         friction: builder of the dry friction.
         drive_gain: initial k, one number or M. It is learned if ``gain_spread`` is positive.
         gain_spread: prior standard deviation of log k; 0 if the input is a torque.
@@ -89,24 +95,26 @@ class KnownMechanics(LearnedConstants):
         driven_joints: names of the joints that the inputs drive, in the order of the inputs. The
             default is all joints, the motors of elastic joints, or none if the data have no inputs.
         input: builder of the servos, if the inputs are targets; k is then ``input.stiffness``.
+        springs: names of the joints with a linear spring to their parent (:class:`JointSprings`).
 
     Raises:
-        ValueError: if the structure has no rigid bodies or other joints than the data, or a body is
-            not physical.
+        ValueError: if the structure has no rigid bodies or other joints than the data or the
+            springs, or ``spread`` names other bodies.
     """
 
     def __init__(
         self,
         statistics: Statistics,
         structure: Structure,
-        start: Literal["generic", "prior"] = "generic",
-        spread: PositiveFloat = 3.0,
+        start: Literal["generic", "prior"] = "prior",
+        spread: PositiveFloat | Mapping[str, PositiveFloat] = _GENERIC_SPREAD,
         friction: FrictionHead = NoFriction,
         drive_gain: PositiveFloat | Sequence[PositiveFloat] = 1.0,
         gain_spread: NonNegativeFloat = 0.0,
         integrator: Integrator | None = None,
         driven_joints: Sequence[str] | None = None,
         input: Callable[..., Servo] | None = None,
+        springs: Sequence[str] = (),
     ):
         if not isinstance(structure, Structure):
             raise ValueError(
@@ -126,17 +134,25 @@ class KnownMechanics(LearnedConstants):
                 f"joints {', '.join(names)} and inputs of {', '.join(driven)}: name the "
                 "joints that have an input, as driven_joints=[...]"
             )
+        if unknown := set(springs) - set(names):
+            expected = ", ".join(names)
+            raise ValueError(f"springs names {', '.join(unknown)}, expected some of {expected}")
         super().__init__(size, statistics.num_inputs)
         self.structure = structure
-        # Rods for the links of an arm. The last body has no link, so a single rod has no size.
-        generic = 100.0 if len(driven) > 1 else math.inf
-        self._largest_ratio = 5.0 if start == "prior" else generic
         self.driven = [names.index(name) for name in driven]
         gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
         acceleration = statistics.acceleration.double()
         joints = tuple(map(Joint, names, structure.turning))
-        bodies = structure.generic_inertia() if start == "generic" else structure.prior_inertia()
-        self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
+        generic = structure.generic_inertia()
+        bodies = structure.prior_inertia() if start == "prior" else generic
+        spreads = _spreads(spread, structure.body_names)
+        if start == "prior":
+            guessed = (bodies == generic).flatten(1).all(1)
+            spreads = torch.where(guessed, spreads.clamp(min=_GENERIC_SPREAD), spreads)
+        self.bodies = PhysicalBodies(bodies, spreads, structure.body_names)
+        # Rods for the links of an arm. The last body has no link, so a single rod has no size.
+        largest = 100.0 if len(driven) > 1 else math.inf
+        self._largest_ratio = 5.0 if spreads.median() <= 1 else largest
         drives = None if input else gain * statistics.u_rms.double()
         force = self._typical_forces(statistics, bodies, drives)
         scales = Scales(statistics, force, named=joints, prior=True)
@@ -152,11 +168,14 @@ class KnownMechanics(LearnedConstants):
         self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, units)
         units = [joint.damping for joint in joints]
         self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, units)
+        offsets = [k for k in self.driven if names[k] not in springs]
         self.offset = RealConstants(
-            0.3 * force[self.driven],
-            [f"{'torque' if j.turns else 'force'} offset of {j.name}" for j in motors.joints],
-            [joint.force for joint in motors.joints],
+            0.3 * force[offsets],
+            [f"{'torque' if joints[k].turns else 'force'} offset of {names[k]}" for k in offsets],
+            [joints[k].force for k in offsets],
         )
+        index = [names.index(name) for name in springs]
+        self.springs = JointSprings(scales, index) if springs else None
         self.friction = friction(scales)
         self.sticking = self.friction.sticking
         self.integrator = with_friction(integrator, self.sticking)
@@ -167,9 +186,11 @@ class KnownMechanics(LearnedConstants):
             self.gain = motors.positive("drive gain", 1.0, gain, gain_spread, units)
         self.register_buffer("fixed_gain", gain.clone())
         self.register_buffer("motors", torch.eye(size)[self.driven], persistent=False)
+        self.register_buffer("offset_joints", torch.eye(size)[offsets], persistent=False)
         self.register_buffer("typical_force", force, persistent=False)
         self.fixed_gain: Tensor
         self.motors: Tensor
+        self.offset_joints: Tensor
         self.typical_force: Tensor
         self.float()
 
@@ -202,8 +223,9 @@ class KnownMechanics(LearnedConstants):
         return self.fixed_gain if self.gain is None else self.gain()
 
     def constant_force(self) -> Tensor:
-        """Return o, ``(N,)``; 0 for passive joints."""
-        return self.offset() @ self.motors
+        """Return o, or k_s q_0 of joints with a spring, ``(N,)``; 0 for other passive joints."""
+        offset = self.offset() @ self.offset_joints
+        return offset if self.springs is None else offset + self.springs.constant_force()
 
     def rotor_inertia(self) -> Tensor:
         """Return r, ``(N,)``; 0 for passive joints."""
@@ -223,7 +245,9 @@ class KnownMechanics(LearnedConstants):
             drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
         drives += self.friction.physical_constants()
         drives += [] if self.gain is None else [self.gain.named()]
-        return [*constants, *drives, *(self.servo.physical_constants() if self.servo else [])]
+        for part in (self.servo, self.springs):
+            drives += [] if part is None else part.physical_constants()
+        return constants + drives
 
     def body_parameters(self) -> Tensor:
         """Return the inertial parameters pi ``(n, 10)``, with M a + C v + G = Y(q, v, a) pi."""
@@ -237,13 +261,15 @@ class KnownMechanics(LearnedConstants):
     def drive_force(
         self, q: Tensor, v: Tensor, a: Tensor, u: Tensor, share: Tensor | None = None
     ) -> Tensor:
-        """Return r a + D v + F - o - motor force, ``(*batch, N)``.
+        """Return r a + D v + F + k_s q - o - motor force, ``(*batch, N)``.
 
         F is the smooth law, or the sliding friction of a share of forward motion. The terms Y pi
         and the forces of elastic joints are not in this force.
         """
         friction = self.friction(v) if share is None else self.friction.sliding(v, share)
         resistance = self.rotor_inertia() * a + self.viscous() * v + friction
+        if self.springs is not None:
+            resistance = resistance + self.springs.springs() * q
         return resistance - self.constant_force() - self.motor_force(q, v, u)
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
@@ -297,14 +323,12 @@ class KnownMechanics(LearnedConstants):
         return force if self.input_affine or not self.servo else force + self.servo.excess(q, v, u)
 
     def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        servo = torch.diag(self.servo.springs()) if self.servo else None
-        if self.elastic is None:
-            return servo
-        joints = self.elastic.matrices()[0]
-        return joints if servo is None else joints + servo
+        springs = [torch.diag(x.springs()) for x in (self.servo, self.springs) if x is not None]
+        springs += [] if self.elastic is None else [self.elastic.matrices()[0]]
+        return torch.stack(springs).sum(0) if springs else None
 
     def _spring_force(self, q: Tensor) -> Tensor:
-        """Return the part of G from servos and elastic joints, ``(*batch, N)``."""
+        """Return the part of G from servos, springs and elastic joints, ``(*batch, N)``."""
         stiffness = self._stiffness_matrix(q)
         return torch.zeros_like(q) if stiffness is None else q @ stiffness
 
@@ -330,3 +354,15 @@ class KnownMechanics(LearnedConstants):
 
     def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
         return self.friction.sliding(v, share)
+
+
+def _spreads(spread: float | Mapping[str, float], bodies: Sequence[str]) -> Tensor:
+    """Return the prior standard deviation of each body, ``(n,)``."""
+    by_name = spread if isinstance(spread, Mapping) else {"default": spread}
+    if unknown := set(by_name) - {"default", *bodies}:
+        raise ValueError(
+            f"spread names {', '.join(unknown)}, expected default and some of the bodies "
+            f"{', '.join(bodies)}"
+        )
+    default = by_name.get("default", _GENERIC_SPREAD)
+    return torch.tensor([by_name.get(name, default) for name in bodies], dtype=torch.float64)

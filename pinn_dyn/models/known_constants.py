@@ -140,13 +140,14 @@ class PhysicalBodies(Constants):
 
     Args:
         start: pseudo-inertias of bodies of positive density, ``(n, 4, 4)``, kg, kg m, kg m^2.
-        spread: prior standard deviation of (a, d, s, t).
+        spread: prior standard deviation of (a, d, s, t), one number or n.
         bodies: n names.
     """
 
     root: Tensor
+    spread: Tensor
 
-    def __init__(self, start: Tensor, spread: float, bodies: Sequence[str]):
+    def __init__(self, start: Tensor, spread: float | Tensor, bodies: Sequence[str]):
         start = start.double()
         for name, body in zip(bodies, start, strict=True):
             smallest = float(torch.linalg.eigvalsh(body)[0])
@@ -165,7 +166,9 @@ class PhysicalBodies(Constants):
         root[:, :3, :3] = torch.linalg.cholesky(start[:, :3, :3] / mass - centre @ centre.mT)
         root[:, :3, 3:], root[:, 3, 3] = centre, 1
         self.register_buffer("root", (mass.sqrt() * root).float())
-        self.spread = spread
+        spreads = torch.as_tensor(spread, dtype=torch.float32).expand(len(start))
+        self.register_buffer("spread", spreads[:, None].clone())
+        self.register_load_state_dict_pre_hook(_add_spread)
 
     def start(self) -> Tensor:
         """Return J_start, ``(n, 4, 4)``."""
@@ -184,3 +187,9 @@ class PhysicalBodies(Constants):
         stretch = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
         root = torch.exp(a)[..., None, None] * (self.root @ stretch)
         return root @ root.mT
+
+
+def _add_spread(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Add the spread to a checkpoint of an earlier version, in which all bodies had the same."""
+    spread = module.get_buffer("spread")
+    state.setdefault(f"{prefix}spread", spread.min().expand_as(spread))

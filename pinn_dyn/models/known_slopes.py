@@ -79,7 +79,10 @@ class KnownSlopes(Slopes):
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
         # Constants of drives have an entry for each driven joint instead of each joint.
-        sides = dict.fromkeys(("armature", "offset", "gain", "servo"), self.model.motors)
+        sides = dict.fromkeys(("armature", "gain", "servo"), self.model.motors)
+        sides["offset"] = self.model.offset_joints
+        if self.model.springs is not None:
+            sides["springs"] = self.model.springs.selection
         if self.model.elastic is not None:
             sides["elastic"] = self.model.elastic.stretch
         parts = [name.split(".")[1] for name in values]

@@ -17,6 +17,9 @@ from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia_basis, 
 from pinn_dyn.systems.segment_frames import cross_matrix
 from pinn_dyn.systems.urdf import read_urdf
 
+_ROUNDED = 0.1  # smallest over largest variance of a mass, below zero by rounded moments
+_LARGEST = 10.0  # radius of gyration of a body, m
+
 
 class Kinematics(NamedTuple):
     """Poses T of the B bodies in the world, and twists xi of the B joints, ``(*batch, B, 4, 4)``.
@@ -325,28 +328,22 @@ class RigidChain(MechanicalSystem):
         """Return pseudo-inertias ``(B, 4, 4)`` of positive density, close to those of the file.
 
         A point mass, rod or plate has a standard deviation of its mass of at least l / 300 along
-        each axis, with the mean distance l of the joints: 1 mm for links of 0.3 m. A body without
-        mass gets 1/10,000 of the mass of the heaviest.
-
-        Raises:
-            ValueError: if no body has a mass, or a mass is negative.
+        each axis, with the mean distance l of the joints: 1 mm for links of 0.3 m. A body that
+        cannot exist is the generic one: without a positive mass, with moments that violate the
+        triangle inequality by more than rounding, or with a radius of gyration of 10 m or more.
         """
         masses = self.inertia[:, 3, 3]
-        if masses.min() < 0 or masses.max() == 0:
-            raise ValueError(
-                f"{self.tree.path}: the bodies {', '.join(self.body_names)} have the masses "
-                f"{masses.tolist()} kg, expected positive ones: correct <inertial>, or use "
-                "start='generic'"
-            )
-        mass = masses.clamp_min(1e-4 * float(masses.max()))[:, None, None]
+        mass = torch.where(masses > 0, masses, 1.0)[:, None, None]
         centre = self.inertia[:, :3, 3:] / mass
-        variance = self.inertia[:, :3, :3] / mass - centre @ centre.mT
-        sizes, axes = torch.linalg.eigh(variance)
-        sizes = sizes.clamp_min((self._usual_length() / 300) ** 2)
+        sizes, axes = torch.linalg.eigh(self.inertia[:, :3, :3] / mass - centre @ centre.mT)
+        smallest, largest, floor = sizes[:, 0], sizes[:, -1], (self._usual_length() / 300) ** 2
+        rounding = floor + _ROUNDED * largest
+        possible = (masses > 0) & (smallest > -rounding) & (largest < _LARGEST**2)
+        sizes = sizes.clamp_min(floor)
         inertia = torch.ones_like(self.inertia)
         inertia[:, :3, :3] = axes * sizes.unsqueeze(-2) @ axes.mT + centre @ centre.mT
         inertia[:, :3, 3:], inertia[:, 3:, :3] = centre, centre.mT
-        return mass * inertia
+        return torch.where(possible[:, None, None], mass * inertia, self.generic_inertia())
 
     def tip_position(self, q: Tensor) -> Tensor:
         """Return the origin of the tip's frame in the frame of the base, ``(*batch, 3)``, m."""

@@ -38,6 +38,7 @@ class RobotConstants(NamedTuple):
         gain: force per input, zero for a passive joint, ``(N,)``.
         bias: constant force, and force of the drive per q and per v, ``(N, 3)``.
         limit: largest force of the drive without its constant, ``(N,)``.
+        stiffness, rest: stiffness and rest position of a spring of the joint, ``(N,)``.
         notes: lines for a comment at the head of the file.
     """
 
@@ -48,6 +49,8 @@ class RobotConstants(NamedTuple):
     gain: Tensor
     bias: Tensor
     limit: Tensor
+    stiffness: Tensor
+    rest: Tensor
     notes: list[str]
 
 
@@ -56,8 +59,8 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
 
     The ``<inertial>`` behind a joint is that of the body: the link and everything fixed to it. That
     of the links fixed to it is zero. Joints that the robot locks become fixed joints. A URDF has no
-    field for armatures, which are in the comment. The remainder is that of the robot's file, or of
-    the stored text if the file has changed. Meshes are relative to ``folder``.
+    field for armatures and springs, which are in the comment. The remainder is that of the robot's
+    file, or of the stored text if the file has changed. Meshes are relative to ``folder``.
     """
     file = _file(robot)
     before = {behind: link for link, behind in file.ends.values()}
@@ -144,6 +147,9 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
             settings["armature"] = exact_text(constants.armature[[number]])
             settings["damping"] = exact_text(constants.damping[[number]])
             settings["frictionloss"] = exact_text(constants.friction[[number]])
+            if constants.stiffness[number] > 0:
+                settings["stiffness"] = exact_text(constants.stiffness[[number]])
+                settings["springref"] = exact_text(constants.rest[[number]])
             low, high = robot.limits[number, :2]
             if low < high and not (turns and high - low > 6.28):
                 settings |= {"range": exact_text([low, high]), "limited": "true"}

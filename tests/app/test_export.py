@@ -28,6 +28,7 @@ MJCF = """<mujoco><worldbody><body name="arm" pos="0 0 1" euler="20 30 40">
 ROBOTS = {
     "tree": (TREE.replace('<link name="bracket">', f'<link name="bracket">{BOX}'), ["wrist"]),
     "spatial": (TREE, ["fork", "slide"]),
+    "springs": (TREE, ["wrist"], Stribeck, ["slide", "bend"]),
     "mjcf": (MJCF, []),
     "panda": ("franka_panda/panda.urdf", FINGERS),
 }
@@ -35,14 +36,15 @@ FORK = '<joint name="fork" type="revolute">'
 STATES = 10
 
 
-def learned(urdf, locked=(), friction=Stribeck, **settings):
+def learned(urdf, locked=(), friction=Stribeck, springs=(), **settings):
     """A model in double precision with random constants."""
     structure = RigidChain(urdf, locked_joints=locked, payload=0.7)
     scales = statistics(structure.num_coordinates)
     if driven := settings.get("driven_joints"):
         inputs = torch.ones(len(driven)).double()
         scales = replace(scales, u_mean=0 * inputs, u_std=inputs)
-    model = KnownMechanics(scales, structure, friction=friction, **settings).double()
+    settings = {"friction": friction, "springs": springs, **settings}
+    model = KnownMechanics(scales, structure, **settings).double()
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -82,13 +84,17 @@ def mujoco_forces(path, names, q, v, a):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_an_exported_robot_has_the_learned_dynamics_elsewhere(name, tmp_path):
+def test_an_exported_robot_has_the_learned_dynamics_elsewhere(name, tmp_path, caplog):
     model = learned(*ROBOTS[name])
     structure, names = model.structure, model.structure.joint_names
     q, v, a = (x.numpy() for x in states(len(names)))
     rigid = structure.rigid_force(*map(torch.from_numpy, (q, v, a)), model.bodies()).numpy()
     drives = model.rotor_inertia().numpy() * a + model.viscous().numpy() * v
+    if name == "springs":
+        stiffness, rest = (part.values.numpy() for part in model.physical_constants()[-2:])
+        drives[:, 1:3] += stiffness * (q[:, 1:3] - rest)
     urdf, mjcf = (export(model, tmp_path / f"arm.{ending}") for ending in ("urdf", "xml"))
+    assert ("a URDF has no springs" in caplog.text) == (name == "springs")
     scale = np.abs(rigid).max()
     np.testing.assert_allclose(
         pinocchio_forces(urdf, names, q, v, a), rigid, rtol=0, atol=1e-9 * scale

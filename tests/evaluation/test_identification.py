@@ -1,9 +1,21 @@
 """Intervals of constants, and directions that stay open."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.evaluation.identification import constants_table, undetermined
+from pinn_dyn.app.constants import write_constants
+from pinn_dyn.evaluation.identification import (
+    common_factor,
+    constants_table,
+    contradicted,
+    undetermined,
+)
+from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
+from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import AsymmetricCoulomb
 from pinn_dyn.training import Fit
 from pinn_dyn.training.constants_fit import Prior
@@ -110,3 +122,50 @@ def test_constants_have_the_units_of_their_joint_and_of_the_input(model):
         "Nm/A",
     ]
     assert constants_table(model, fit).set_index("name").unit["drive gain of turn"] == "Nm/u"
+
+
+def test_motions_leave_open_what_the_check_of_a_log_names(model, tmp_path):
+    """The slider rests in one of two logs, and all joints move in the other."""
+    t = 0.01 * torch.arange(600).double()
+    rates = torch.tensor([[1.1, 1.7, 2.3, 3.1], [4.3, 5.9, 7.1, 3.7]]).double()
+    phases = t[:, None, None] * rates
+    q, v = phases.sin().sum(1), (rates * phases.cos()).sum(1)
+    runs = [Trajectory(q, v, Signal(t, q))]
+    resting = [Trajectory(q * RESTING, v * RESTING, Signal(t, q))]
+    fit, counts = fit_with(model, [1.0] * len(model.parameter_names())), []
+    for motion in (runs, resting):
+        excitation = rigid_excitation(model.structure, motion, cutoff=6.0)
+        source = SimpleNamespace(input_labels=list("uuuu"))
+        write_constants(model, fit, source, tmp_path, motion, cutoff=6.0)
+        text = (tmp_path / "undetermined.md").read_text()
+        lines = [line[2:] for line in text.splitlines() if line.startswith("- ")]
+        assert ("; ".join(lines) or "none") == excitation.undetermined
+        assert text.startswith(f"{len(lines)} of {excitation.count} base parameters")
+        move = f"Move {', '.join(excitation.open_joints)} at more"
+        assert (move in text) == bool(lines)
+        counts.append(len(lines))
+        assert "per drive gain only" in text
+    assert counts[0] < counts[1]
+
+
+RESTING = torch.tensor([1, 0, 1, 1])
+
+
+def test_bodies_and_gains_that_data_move_far_from_their_prior_are_named():
+    model = known_model(friction=None, gain_spread=0.5, spread={"default": 0.3, "elbow": 3.0})
+    fit = fit_with(model, [0.5] * len(model.parameter_names()))
+    with torch.no_grad():
+        model.bodies.z[0, :2] = torch.tensor([-3.5, 2.9])
+        model.gain.z[1] = 4.2
+        model.viscous.z[2] = -5.0  # the prior of friction is a guess
+    body, gain = contradicted(model, fit)
+    assert body.startswith("the data move shoulder far from its prior, mass by 3.5 standard")
+    assert body.endswith("'model.spread={default: 0.3, shoulder: 3}'")
+    assert gain.startswith("the data move slide far from its prior, drive gain by 4.2 standard")
+    later = fit.prior._replace(mean=fit.prior.mean + 1)
+    assert not contradicted(model, replace(fit, prior=later))  # the prior is an earlier fit
+
+
+def test_the_common_factor_of_gains_is_that_of_their_mean(model):
+    variances = [1.0 if "gain" in name else 0.1 for name in model.parameter_names()]
+    assert common_factor(model, fit_with(model, variances)) == pytest.approx(np.exp(1.96 * 0.25))

@@ -46,7 +46,7 @@ def recording(seed, load=None, urdf=ARM, seconds=20.0, rate=100.0):
 def identified(seed, load, urdf=ARM, samples=1000):
     structure = RigidChain(urdf)
     scales = statistics(structure.num_coordinates)
-    model = KnownMechanics(scales, structure, friction=CoulombFriction)
+    model = KnownMechanics(scales, structure, start="generic", friction=CoulombFriction)
     without, loaded = recording(seed, None, urdf), recording(seed + 1000, load, urdf)
     return identify_payload(model, [without], [loaded], cutoff=6.0, samples=samples)
 

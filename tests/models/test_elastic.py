@@ -83,7 +83,7 @@ def test_a_load_behind_elastic_joints_is_identified():
     mass, center = 0.9, np.array([0.05, -0.03, -0.1])
     runs = [[flexible_arm(8.0, k, load=x)] for k, x in enumerate((None, (mass, center, np.eye(3))))]
     windows = draw_windows(runs[0], count=60, steps=10, stride=1, seed=0)
-    model = KnownMechanics(windows.statistics(), ElasticJoints(RigidChain(ARM)))
+    model = KnownMechanics(windows.statistics(), ElasticJoints(RigidChain(ARM)), start="generic")
     table = identify_payload(model, *runs, cutoff=20.0, samples=2000).set_index("name")
     assert table.attrs["frame"] == "lower"
     for name, value in zip(

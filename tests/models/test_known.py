@@ -30,7 +30,7 @@ class TestKnownMechanicsContract(MechanicalSystemContract):
 
     @pytest.fixture
     def system(self):
-        model = known_model(friction=None, gain_spread=0.5, drive_gain=2.0)
+        model = known_model(friction=None, gain_spread=0.5, drive_gain=2.0, springs=["bend"])
         return anywhere(model, std=0.2)
 
 
@@ -41,6 +41,22 @@ def test_the_prior_start_is_the_urdfs_robot():
     drives = model.armature() * a + model.viscous() * v - model.offset()
     expected = chain.inverse_dynamics(q, v, a) + drives
     assert torch.allclose(model.inverse_dynamics(q, v, a), expected, rtol=1e-5, atol=1e-4)
+
+
+def test_springs_store_half_k_times_the_square_of_their_stretch():
+    plain, model = known_model(), anywhere(known_model(springs=["slide", "bend"]))
+    with torch.no_grad():
+        model.bodies.z.copy_(plain.bodies.z)
+        model.offset.z.copy_(plain.offset.z[[0, 3]])  # of the other joints
+        q = torch.randn(20, 4).double()
+        energy = model.potential_energy(q) - plain.potential_energy(q)
+        stiffness, rest = (part.values for part in model.physical_constants()[-2:])
+    assert model.physical_constants()[-1].names == ["rest position of slide", "rest angle of bend"]
+    assert model.physical_constants()[-2].units == ["N/m", "Nm/rad"]
+    expected = (0.5 * stiffness * (q[:, [1, 2]] - rest) ** 2).sum(-1)
+    torch.testing.assert_close(energy - energy[0], expected - expected[0])
+    with pytest.raises(ValueError, match=r"springs names knee, expected some of turn, slide"):
+        known_model(springs=["knee"])
 
 
 def test_the_generic_start_ignores_the_urdfs_inertias():
@@ -100,6 +116,33 @@ def test_a_body_that_cannot_be_is_named():
         PhysicalBodies(impossible, 1.0, chain.body_names)
 
 
+def test_the_bodies_of_the_file_are_the_start_and_generic_ones_have_a_wide_prior():
+    """By the default, and with another spread for one of the bodies."""
+    text = TREE.replace('mass value="0.7"', 'mass value="-0.7"')
+    chain = RigidChain(text, locked_joints=["wrist"])
+    spread = {"default": 0.3, "elbow": 2.0}
+    model = KnownMechanics(statistics(4), chain, spread=spread)
+    prior, generic = chain.prior_inertia(), chain.generic_inertia()
+    start = model.bodies.start().double()
+    assert chain.body_names[:3] == ["shoulder", "slider", "elbow"]
+    torch.testing.assert_close(start[1], generic[1], rtol=1e-5, atol=1e-6)
+    for k in (0, 2, 3):
+        torch.testing.assert_close(start[k], chain.inertia[k].double(), rtol=1e-5, atol=1e-6)
+    assert torch.equal(prior[1], generic[1].to(prior))
+    assert model.bodies.spread.flatten().tolist() == pytest.approx([0.3, 3.0, 2.0, 0.3])
+    with pytest.raises(ValueError, match=r"spread names arm, expected default .* shoulder, slider"):
+        KnownMechanics(statistics(4), chain, spread={"arm": 1.0})
+
+
+def test_a_checkpoint_of_an_earlier_version_has_the_same_spread_for_all_bodies():
+    chain = RigidChain(TREE.replace("0.7", "-0.7"))
+    model = KnownMechanics(statistics(5), chain, spread=0.5)
+    state = model.state_dict()
+    del state["bodies.spread"]
+    model.load_state_dict(state)
+    assert model.bodies.spread.unique().tolist() == [0.5]
+
+
 def test_standardized_constants():
     positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"], ["kg", "kg"])
     real = RealConstants(torch.tensor([4.0]), ["c"], ["N"])
@@ -145,5 +188,5 @@ def test_the_ratio_of_forces_counts_per_input():
         model.gain.z.fill_(math.log(0.5) / 0.7)
         torch.testing.assert_close(model.force_ratio(q, v, a)[0], 2 * ratio)
         mass = math.log(0.5) / 2 / model.bodies.spread
-        model.bodies.z[:, 0] = mass
+        model.bodies.z[:, :1] = mass
         torch.testing.assert_close(model.force_ratio(q, v, a)[0], ratio, rtol=1e-5, atol=0)

@@ -40,6 +40,7 @@ def known_model(urdf=TREE, locked_joints=("wrist",), friction=Stribeck, **settin
     structure = RigidChain(urdf, locked_joints=locked_joints)
     friction = partial(friction, width=0.3) if friction else None
     heads = {"friction": friction} if friction else {}
+    settings = {"start": "generic", **settings}
     scales = statistics(structure.num_coordinates)
     model = KnownMechanics(scales, structure, **heads, **settings).double()
     # The model is built in single precision, in which rotations are no longer exact.
@@ -53,7 +54,7 @@ def elastic_model(urdf=TREE, locked_joints=("wrist",), joints=("turn", "bend"), 
     structure = ElasticJoints(chain, joints=joints, stiffness=10.0)
     data, inputs = statistics(structure.num_coordinates), statistics(chain.num_coordinates)
     data = replace(data, u_mean=inputs.u_mean, u_std=inputs.u_std)
-    model = KnownMechanics(data, structure, **settings).double()
+    model = KnownMechanics(data, structure, start="generic", **settings).double()
     model.structure.chain = RigidChain(urdf, locked_joints=locked_joints)
     return model
 

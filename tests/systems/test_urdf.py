@@ -143,23 +143,32 @@ def test_inertias_and_limits_that_a_fit_does_not_use_are_not_checked(old, new):
     torch.testing.assert_close(chain.generic_inertia(), usual.generic_inertia())
 
 
-def test_inertias_that_a_fit_starts_from_are_physical_or_refused():
+def test_a_fit_starts_from_the_inertias_of_bodies_that_can_exist():
     point = '<inertial><origin xyz="0 0 -0.3"/><mass value="1.5"/></inertial>'
-    inertial = ARM[ARM.index("<inertial>") : ARM.index("</link>")]
-    for text in (
-        changed((inertial, point)),
-        changed((inertial, "")),
-        changed(UNUSED["no triangle"]),
-    ):
-        chain = RigidChain(text)
-        assert torch.linalg.eigvalsh(chain.prior_inertia()).min() > 0
-        q = torch.tensor([0.3, -0.7]).double()
-        mass, prior = chain.mass_matrix(q), chain.mass_matrix(q, chain.prior_inertia())
-        torch.testing.assert_close(prior, mass, rtol=0.05, atol=1e-4)
+    chain = RigidChain(changed((UNUSED["no inertial"][0], point)))
+    assert torch.linalg.eigvalsh(chain.prior_inertia()).min() > 0
+    q = torch.tensor([0.3, -0.7]).double()
+    mass, prior = chain.mass_matrix(q), chain.mass_matrix(q, chain.prior_inertia())
+    torch.testing.assert_close(prior, mass, rtol=0.05, atol=1e-4)
+    rounded = RigidChain(changed(('izz="0.1"', 'izz="0.143"')))  # 0.14 of a plate, rounded
+    torch.testing.assert_close(rounded.prior_inertia()[0, 3], rounded.inertia[0, 3])
     torch.testing.assert_close(RigidChain(ARM).prior_inertia(), RigidChain(ARM).inertia)
-    assert RigidChain(changed(UNUSED["no triangle"])).tree.problems
-    with pytest.raises(ValueError, match=r"-1.5, 0.8.*start='generic'"):
-        RigidChain(changed(UNUSED["a negative mass"])).prior_inertia()
+
+
+IMPOSSIBLE = {
+    **{name: UNUSED[name] for name in ("no triangle", "a negative mass", "no inertial")},
+    "kg mm^2": ('ixx="0.09" ixy="0" ixz="0" iyy="0.05"', 'ixx="9e4" ixy="0" ixz="0" iyy="9e4"'),
+}
+
+
+@pytest.mark.parametrize("change", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
+def test_a_fit_starts_from_a_rod_only_for_a_body_that_cannot_exist(change):
+    chain, usual = RigidChain(changed(change)), RigidChain(ARM)
+    expected = torch.stack([usual.generic_inertia()[0], usual.inertia[1]])
+    torch.testing.assert_close(chain.prior_inertia(), expected)
+
+
+def test_a_robot_with_negative_masses_is_not_simulated():
     with pytest.raises(ValueError, match=r"M has the eigenvalue .*link 'upper' has mass -15 kg"):
         RigidChain(changed(('value="1.5"', 'value="-15"'))).check_domain([], [])
 

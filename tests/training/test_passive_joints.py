@@ -97,9 +97,8 @@ def fitted(motions):
         q, v = torch.from_numpy(x).chunk(2, dim=-1)
         runs.append(Trajectory(q, v, Signal(torch.from_numpy(T), torch.from_numpy(u[:, None]))))
     windows = draw_windows(runs, count=40, steps=4, stride=4, seed=0)
-    model = KnownMechanics(
-        windows.statistics(), RigidChain(URDF), friction=CoulombFriction, driven_joints=["elbow"]
-    )
+    settings = {"friction": CoulombFriction, "driven_joints": ["elbow"], "start": "generic"}
+    model = KnownMechanics(windows.statistics(), RigidChain(URDF), **settings)
     fit = LeastSquares(cutoff=10.0, samples=600).fit(model, runs, windows)
     return model.double(), fit, runs
 

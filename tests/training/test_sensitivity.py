@@ -14,11 +14,13 @@ from pinn_dyn.training.sensitivity import rollout_slopes
 from tests.support.known import elastic_model, known_arm, known_model, motion, windows_of
 
 MODELS = {
-    "Stribeck": lambda: known_model(gain_spread=0.3, friction=Stribeck),
+    "Stribeck": lambda: known_model(gain_spread=0.3, friction=Stribeck, springs=["bend", "turn"]),
     "servos": lambda: known_model(
         friction=Stribeck, input=partial(Servo, stiffness=3.0, limit="learned")
     ),
-    "elastic joints": lambda: elastic_model(friction=Stribeck, gain_spread=0.3),
+    "elastic joints": lambda: elastic_model(
+        friction=Stribeck, gain_spread=0.3, springs=["fork", "turn"]
+    ),
     "soft arm": known_arm,
     "two segments": lambda: known_arm(2),
 }
