@@ -315,11 +315,20 @@ class RigidChain(MechanicalSystem):
 
         A rod leads to the farthest next joint, or, where that is nearer than half the mean
         distance, along the joint's axis by the mean distance. Its radius is a sixth of that mean.
+        The last rod behind a turning joint has 45 degrees to the axis, and hangs down at q = 0: on
+        the axis, gravity and inertia would have no torque.
         """
-        ends = self._ends()
         usual = self._usual_length()
+        origin = torch.zeros(self.num_coordinates).to(self._axes)
+        downs = self.kinematics(origin).poses[:, :3, :3].mT @ self._gravity
         bodies = []
-        for end, axis in zip(ends, self._axes.double(), strict=True):
+        columns = self._ends(), self._axes.double(), downs.double(), self._turning
+        for end, axis, down, turns in zip(*columns, strict=True):
+            if end is None and turns:
+                directions = torch.cat([down[None] / 9.81, torch.eye(3).to(down)])
+                across = directions - (directions @ axis)[:, None] * axis
+                side = next(x for x in across if x.norm() > 0.1)
+                end = usual * (axis + side / side.norm()) / 2**0.5
             end = usual * axis if end is None or end.norm() < usual / 2 else end
             bodies.append(rod(torch.zeros_like(end), end, radius=usual / 6, density=density))
         return torch.stack(bodies)

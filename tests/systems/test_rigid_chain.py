@@ -175,6 +175,21 @@ def test_a_generic_body_is_a_cylinder_to_the_farthest_next_joint():
     np.testing.assert_allclose(inertial_parameters(body), expected, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("axis", ["1 0 0", "0 1 0", "0 0 1"])
+def test_a_last_generic_body_does_not_lie_on_the_axis(axis):
+    swing = joint("swing", "revolute", "base", "pole", xyz="0 0 0", rpy="0 0 0", axis=axis)
+    chain = RigidChain(robot(link("base"), link("pole"), swing))
+    body = chain.generic_inertia()
+    centre = body[0, :3, 3] / body[0, 3, 3]
+    along = torch.tensor([float(x) for x in axis.split()]).double()
+    assert float(torch.linalg.cross(centre, along).norm()) > 0.03  # of a rod of 0.1 m
+    if axis != "0 0 1":  # hangs down at q = 0
+        force = chain.rigid_force(
+            0.5 * torch.ones(1, 1).double(), *torch.zeros(2, 1, 1).double(), body
+        )
+        assert float(force) > 0
+
+
 @pytest.mark.slow
 @NEEDS_COMPILER
 def test_compiled_it_is_the_same_chain():
