@@ -96,12 +96,11 @@ def _units(item: Named, input_units: Sequence[str]) -> list[str]:
 def _jacobian(model: LearnedConstants) -> Tensor:
     """Return dc/dz of all constants by all parameters, ``(P, P)``."""
     values = torch.cat([item.values for item in model.physical_constants()])
-    parameters = list(model.parameters())
-    rows = []
-    for value in values:
-        slopes = torch.autograd.grad(value, parameters, retain_graph=True, materialize_grads=True)
-        rows.append(torch.cat([part.flatten() for part in slopes]))
-    return torch.stack(rows)
+    unit = torch.eye(len(values)).to(values)
+    slopes = torch.autograd.grad(
+        values, list(model.parameters()), unit, is_grads_batched=True, materialize_grads=True
+    )
+    return torch.cat([part.flatten(1) for part in slopes], dim=1)
 
 
 def undetermined(model: LearnedConstants, fit: Fit) -> list[str]:
