@@ -104,6 +104,7 @@ class _Loaded(nn.Module):
         self.to_body = inertial_parameters(basis).T
         self.columns = slice(10 * body, 10 * body + 10)
 
+    has_passive_joints = False  # the equation of a load has no mass matrix
     parameter_names = LearnedConstants.parameter_names
 
     def physical_constants(self) -> list[Named]:

@@ -25,6 +25,11 @@ class LearnedConstants(MechanicalSystem):
     methods below follow from the terms. A subclass with closed formulas may override them.
     """
 
+    @property
+    def has_passive_joints(self) -> bool:
+        """True if coordinates have no input, so that no bodies explain their equation."""
+        return self.num_inputs < self.num_coordinates
+
     def parameter_names(self) -> list[str]:
         """Return the meaning of each parameter, or the name of its attribute."""
         names: list[str] = []

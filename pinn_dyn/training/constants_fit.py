@@ -99,8 +99,8 @@ def posterior_covariance(information: Tensor, root: Tensor, scores: Tensor | Non
 
 def block_scores(
     slopes: Tensor, errors: Tensor, partitions: Sequence[Tensor], root: Tensor
-) -> tuple[Tensor, float]:
-    """Return the covariance B of the scores J^T r, and the mean of B / J^T J::
+) -> Tensor:
+    """Return the covariance B of the scores J^T r::
 
         B = sum over k of J_k^T J_k r_k^2 + sum over partitions and their blocks b of s_b s_b^T
         s_b = (1 - J_b^T J_b H^-1)^-1 J_b^T r_b,    H = J^T J + R^T R
@@ -129,8 +129,7 @@ def block_scores(
     joined = torch.cat(scores)
     covariance = joined.T @ joined
     dual = root.T @ vectors * (1 + values).sqrt()
-    ratio = float(covariance.trace() / (values / (1 + values)).sum())
-    return dual @ covariance @ dual.T, ratio
+    return dual @ covariance @ dual.T
 
 
 def _whitened(information: Tensor, root: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -6,17 +6,18 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
-import numpy as np
 import scipy
 import torch
 from pydantic import Field, PositiveFloat
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from pinn_dyn.data.windows import Windows
+from pinn_dyn.data.windows import Windows, draw_windows
 from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.mechanics.arrays import spd_solve
+from pinn_dyn.mechanics.sliding import hold
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.progress import Progress
 from pinn_dyn.training.constants_fit import (
@@ -29,7 +30,8 @@ from pinn_dyn.training.constants_fit import (
     posterior_covariance,
 )
 from pinn_dyn.training.filtered_motion import filtered_motion
-from pinn_dyn.training.sensitivity import rollout_slopes
+from pinn_dyn.training.gauss_newton import GaussNewton
+from pinn_dyn.training.sensitivity import WindowRollouts
 
 log = logging.getLogger(__name__)
 
@@ -38,16 +40,16 @@ AtLeastTwo = Annotated[int, Field(ge=2)]
 
 REST = 0.05
 """Share of the typical speed of a joint below which it is considered at rest."""
-_CHUNK = 500  # windows whose derivatives are rolled out at once, to limit the memory
 _CHEAP = 8  # evaluations of the inverse dynamics in the time of one rollout
-_PASSES = 3  # fits of a stage, to estimate the noise
 _BLOCKS = 30  # blocks of the motion, and neighborhoods of windows
 _SPEEDS = 16  # blocks of the speeds of a joint
-_FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
 _SCALE = 100.0  # root of the prior precision of the last mass of a robot without inputs
 _LEVEL = 0.95  # level of the one-sided test for a larger validation error
 _NOISE = 0.2  # largest relative difference of validation errors that may be noise
+_FEWEST_WINDOWS = 10
+_IMPROVED = 0.95  # of the validation error, from which longer windows follow
+_TOLERANCE = 1e-2  # smallest relative decrease of the cost by a step of rollouts
 _DIVERGED = 1e4  # residual of a diverged rollout
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
@@ -58,39 +60,45 @@ Residuals = Callable[[bool], Tensor]
 
 
 class LeastSquares:
-    """Maximum a posteriori fit by Gauss-Newton with a trust region (``scipy.optimize``)::
+    """Maximum a posteriori fit by Gauss-Newton steps (:class:`~.gauss_newton.GaussNewton`)::
 
-        min over z of  |r(z)|^2 / s^2 + (z - z_0)^T P (z - z_0)
+        min over z of  w^2 sum of rho(r(z)) + (z - z_0)^T P (z - z_0)
 
     z are the standardized parameters of the model, with the prior z_0 = 0 and P = 1. After an
     earlier fit, z_0 is its result and P the inverse of its covariance, except for bodies that have
-    ``changed`` since, such as a payload. A fit has two stages:
+    ``changed`` since, such as a payload. A fit has two kinds of stages:
 
     1. Inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), in units of the spread of the
        forces, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. Joints
-       at rest are excluded, since dry friction may then have any value up to its level. Without
-       inputs r is the error of the acceleration, which no common factor of the forces changes:
-       the mass of the last body stays that of the prior.
+       at rest are excluded, since dry friction may then have any value up to its level. If a joint
+       has no input, r is the error of the acceleration instead: zero bodies would have no error of
+       the force at such a joint. Without any input, no common factor of the forces changes the
+       motion, and the mass of the last body stays that of the prior.
     2. Rollouts: r = predicted minus measured increments of the windows, in units of their spread,
-       as in the increment loss. The first rollouts use a quarter of the steps of the windows.
+       as in the increment loss. The first rollouts use a quarter of the steps of the windows. While
+       a stage lowers the validation error by 5 %, windows of twice the length and half the number
+       follow.
 
     The kept stage is the last one whose validation error is not clearly larger than the smallest,
-    since later stages fit what is predicted. An error is clearly larger if it is 20 % larger, or if
+    since later stages fit what is predicted; windows longer than the given ones are kept only if
+    the error is smaller. An error is clearly larger if it is 20 % larger, or if
     a paired t-test over V parts of the validation motions is significant (95 %, one-sided). Without
     validation, the last stage is kept.
 
-    s^2 is the mean square of the residuals times the number of correlated residuals that count as
-    one, estimated by repeating each stage. The covariance of z, and this number, follow from sums
-    over blocks (:func:`~.constants_fit.block_scores`): successive samples or neighboring windows,
-    and similar speeds of a joint, at which an error of the friction law repeats.
+    rho is the square for the inverse dynamics. The rollouts use soft L1 by default: windows that no
+    constants explain, such as after a contact, do not bend the constants. The covariance of z
+    follows from sums over blocks (:func:`~.constants_fit.block_scores`): successive samples or
+    neighboring windows, and similar speeds of a joint, at which an error of the friction law
+    repeats.
 
     Args:
         cutoff: cutoff of the filter, Hz, above the frequencies of the motion and below the noise.
-        rollouts: true for both stages, false for the identification only.
+        rollouts: true for all stages, false for the identification only.
         samples: number of samples of the inverse dynamics.
         evaluations: largest number of evaluations of the residuals in a stage.
         velocity_weight: weight of the velocity half in the rollouts, as in the loss.
         changed: bodies, such as ``tip`` in ``mass of tip``, that are fitted anew.
+        loss: loss of the rollouts, ``"soft_l1"`` or ``"squares"``.
     """
 
     def __init__(
@@ -102,10 +110,11 @@ class LeastSquares:
         evaluations: AtLeastTwo = 25,
         velocity_weight: PositiveFloat = 1.0,
         changed: Sequence[str] = (),
+        loss: Literal["soft_l1", "squares"] = "soft_l1",
     ):
         self.cutoff, self.rollouts, self.samples = cutoff, rollouts, samples
         self.evaluations, self.velocity_weight = evaluations, velocity_weight
-        self.changed = list(changed)
+        self.changed, self.loss = list(changed), loss
 
     def fit(
         self,
@@ -136,6 +145,7 @@ class LeastSquares:
         model.double()
         prior = stopped.prior if stopped else self._prior(model, covariance)
         earlier = covariance is not None
+        growth: list[Windows] = []
         stages = {IDENTIFICATION: partial(self._identify, model, prior, trajectories, earlier)}
         if self.rollouts:
             assert windows is not None
@@ -148,10 +158,13 @@ class LeastSquares:
             # Short windows first: from a poor start, long windows diverge or end in a poor minimum.
             short = -(-steps // 4)
             enough = size * _informative_blocks(short) * short >= count
-            for length in [short, steps] if enough and short < steps else [steps]:
-                part = windows.first(length)
+            lengths = [short, steps] if enough and short < steps else [steps]
+            parts = [windows.first(length) for length in lengths]
+            growth = [] if validate is None else _longer(trajectories, windows)
+            for part in [*parts, *growth]:
                 name = f"rollouts of {float(part.t[-1]):.3g} s"
                 stages[name] = partial(self._roll_out, name, model, prior, part)
+        planned = len(stages) - len(growth)
         best, number = stopped, (stopped.stopped_in or 0) if stopped else 0
         lowest = best.errors if best else UNKNOWN
         texts = [f"{best.stage} {lowest.mean():.4g}"] if best and best.stage else []
@@ -160,10 +173,16 @@ class LeastSquares:
                 result = solve()
                 errors = UNKNOWN if validate is None else validate(model)
                 texts.append(f"{stage} {errors.mean():.4g}")
-                kept = best if best and _clearly_larger(errors, lowest) else result
+                worse = _clearly_larger(errors, lowest)
+                if number >= planned:  # longer windows must predict better
+                    worse = bool(errors.mean() > lowest.mean())
+                kept = best if best and worse else result
+                grows = errors.mean() < _IMPROVED * lowest.mean()
                 lowest = lowest if lowest.mean() <= errors.mean() else errors
                 best = replace(kept, stage=kept.stage or stage, errors=lowest)
                 number += 1
+                if number >= planned and not grows:
+                    break
         except KeyboardInterrupt as interrupt:
             zero = torch.zeros_like(prior.root)
             covariance = posterior_covariance(zero, prior.root)
@@ -210,21 +229,23 @@ class LeastSquares:
         self, model: LearnedConstants, prior: Prior, runs: Sequence[Trajectory], earlier: bool
     ) -> Fit:
         q, v, a, u = filtered_motion(runs, self.cutoff, self.samples)
-        passive = not model.num_inputs
-        with torch.no_grad():
-            spread = a.std(0) if passive else model.force_scale(q, v, a, u)
         moves = v.abs() > REST * v.std(0)
         if not moves.any():
             raise ValueError("least squares: no joint moves in the training trajectories")
         source = f"{len(q)} samples of filtered motion, without joints at rest,"
         remedy = "record longer motions of all joints, or raise optimizer.samples"
         _require_enough(int(moves.sum()), len(prior.mean), source, remedy, earlier)
-        samples = model.samples(q, v, a, u)
+        samples, passive = model.samples(q, v, a, u), model.has_passive_joints
+        with torch.no_grad():
+            spread = a.std(0) if passive else model.force_scale(q, v, a, u)
 
         def errors() -> Tensor:
-            if passive:
-                return (a - model.forward_dynamics(q, v, u)) / spread
-            return samples.missing_force() / model.drive_gain() / spread
+            force = samples.missing_force()
+            if not passive:
+                return force / model.drive_gain() / spread
+            # Joints at rest have the measured acceleration.
+            force = torch.where(moves, force, 0.0)
+            return spd_solve(hold(model.mass_matrix(q), ~moves), force) / spread
 
         def residuals(derivative: bool) -> Tensor:
             error = errors()
@@ -233,7 +254,9 @@ class LeastSquares:
             if passive:
                 # The missing force is zero at the predicted acceleration.
                 by_z = model.slopes().by_parameters(q, v, a - error * spread, u)
-                return (torch.linalg.solve(model.mass_matrix(q), by_z) / spread[:, None])[moves]
+                mass = hold(model.mass_matrix(q), ~moves)
+                by_z = torch.linalg.solve(mass, torch.where(moves[..., None], by_z, 0.0))
+                return (by_z / spread[:, None])[moves]
             by_gain = (error * spread).unsqueeze(-1) * model.slopes().gain()
             by_z = samples.by_parameters() - by_gain
             return (by_z / (model.drive_gain() * spread).unsqueeze(-1))[moves]
@@ -243,14 +266,9 @@ class LeastSquares:
         times = torch.arange(len(q)).mul(blocks).div(len(q), rounding_mode="floor")
         partitions = [times[:, None].expand_as(v)[moves], _speeds(v)[moves]]
         group, limit = max(len(q) / (2 * periods), 1.0), _CHEAP * self.evaluations
-        solve = partial(self._solve, IDENTIFICATION, model, prior, residuals)
-        result = solve(partitions, group, limit, 1e-6)
-        with torch.no_grad():
-            scale = spread if passive else model.force_scale(q, v, a, u)
-        if not torch.allclose(scale, spread):
-            # The scale of a passive joint is the force of the bodies, which were a guess.
-            spread.copy_(scale)
-            result = solve(partitions, group, limit, 1e-6)
+        result = self._solve(
+            IDENTIFICATION, model, prior, residuals, partitions, group, limit, 1e-6, robust=False
+        )
         with torch.no_grad():
             doubt = doubtful_units(*model.force_ratio(q, v, a), errors().std(0))
         if doubt:
@@ -263,12 +281,12 @@ class LeastSquares:
         x0, measured = windows.start("qv"), windows.increments("qv")
         first = (2 - _informative_blocks(measured.shape[1])) * model.num_coordinates
 
+        rollouts = WindowRollouts(model, windows)
+
         def residuals(derivative: bool) -> Tensor:
             if derivative:
-                parts = [rollout_slopes(model, part) for part in windows.split(_CHUNK)]
-                return (torch.cat(parts) / scale.unsqueeze(-1))[:, :, first:]
-            predicted = model.increments(x0, windows.t, windows.input)
-            return ((predicted[:, 1:] - measured) / scale)[..., first:]
+                return (rollouts.slopes() / scale.unsqueeze(-1))[:, :, first:]
+            return ((rollouts.increments() - measured) / scale)[..., first:]
 
         # Windows that overlap have neighboring starts, and so have similar errors of the model.
         starts = x0 / x0.std(0, correction=0).clamp(min=1e-12)
@@ -280,7 +298,15 @@ class LeastSquares:
         labels = [torch.from_numpy(near)[:, None, None], speeds]
         partitions = [label.expand(size).flatten() for label in labels]
         return self._solve(
-            stage, model, prior, residuals, partitions, float(size[1]), self.evaluations, 1e-4
+            stage,
+            model,
+            prior,
+            residuals,
+            partitions,
+            float(size[1]),
+            self.evaluations,
+            _TOLERANCE,
+            robust=self.loss == "soft_l1",
         )
 
     def _solve(
@@ -293,65 +319,40 @@ class LeastSquares:
         group: float,
         limit: int,
         tolerance: float,
+        robust: bool,
     ) -> Fit:
-        """Fit repeatedly, with the noise of the previous fit; ``group`` residuals count as one."""
+        """Fit from the present z; ``group`` residuals count as one."""
+        task = f"least squares, {stage}"
         z = parameters_to_vector(model.parameters()).detach()
-        mean, root = prior.mean.numpy(), prior.root.numpy()
+        problem = GaussNewton(partial(_evaluate, model, residuals), z, prior, group, robust)
 
-        def spread(at: np.ndarray) -> float:
-            square = np.mean(_evaluate(model, at, residuals, False) ** 2)
-            return max(float(np.sqrt(square)), np.finfo(float).eps)
+        def report() -> None:
+            progress.update(problem.evaluations, f", residual {problem.noise:.4f}")
 
-        weight, steps = 1 / (min(spread(z.numpy()), _FIRST_NOISE) * group**0.5), 0
-        best, evaluations = (np.inf, z.numpy()), 0
-        task = f"least squares, {stage}", _PASSES * limit, "evaluations or fewer"
-        for _ in range(_PASSES):
-            best = np.inf, best[1]
-
-            def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
-                nonlocal best, evaluations
-                error = _evaluate(model, at, residuals, False)
-                evaluations += 1
-                progress.update(evaluations, f", residual {np.mean(error**2) ** 0.5:.4f}")
-                data = weight * error
-                errors = np.concatenate([data, root @ (at - mean)])
-                if (cost := float(errors @ errors)) < best[0]:
-                    best = cost, at.copy()
-                return errors
-
-            def slope(at: np.ndarray, weight: float = weight) -> np.ndarray:
-                data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
-                return np.concatenate([data, root])
-
-            settings = {"max_nfev": limit, "ftol": tolerance, "xtol": tolerance, "gtol": 1e-8}
+        with Progress(task, limit, "evaluations or fewer") as progress:
             try:
-                with Progress(*task) as progress:
-                    solution = scipy.optimize.least_squares(value, z.numpy(), slope, **settings)
-            except KeyboardInterrupt:
-                vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
-                raise
-            z = torch.from_numpy(solution.x)
-            slopes, data = (torch.from_numpy(x[: -len(z)]) for x in (solution.jac, solution.fun))
-            scores, ratio = block_scores(slopes, data, partitions, prior.root)
-            information = slopes.T @ slopes
-            noise = spread(solution.x)
-            weight = min(weight / max(np.finfo(float).eps, ratio) ** 0.5, 1 / noise)
-            steps += int(solution.njev)
-            log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
+                problem.minimize(limit, tolerance, report)
+            finally:
+                vector_to_parameters(problem.z, model.parameters())
+        log.info("%s: residual %.4f after %d steps", task, problem.noise, problem.steps)
+        scores = block_scores(problem.slopes, problem.data, partitions, prior.root)
+        information = problem.slopes.T @ problem.slopes
         covariance = posterior_covariance(information, prior.root, scores)
-        return Fit(covariance, information, prior, noise, steps, z, scores=scores)
+        return Fit(
+            covariance, information, prior, problem.noise, problem.steps, problem.z, scores=scores
+        )
 
 
-def _evaluate(
-    model: LearnedConstants, z: np.ndarray, residuals: Residuals, derivative: bool
-) -> np.ndarray:
-    """Return the residuals at z, flattened. A diverged rollout has large residuals."""
+def _evaluate(model: LearnedConstants, residuals: Residuals, z: Tensor, derivative: bool) -> Tensor:
+    """Return the residuals at z, or their derivatives. A diverged rollout has large residuals."""
     with torch.no_grad():
-        vector_to_parameters(torch.from_numpy(z), model.parameters())
-        result = residuals(derivative)
-    bad = 0.0 if derivative else _DIVERGED
-    values = np.nan_to_num(result.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
-    return values if derivative else values.clip(-_DIVERGED, _DIVERGED)
+        vector_to_parameters(z, model.parameters())
+        values = residuals(derivative)
+    if derivative:
+        return values.reshape(-1, len(z)).nan_to_num(0.0, 0.0, 0.0)
+    return (
+        values.flatten().nan_to_num(_DIVERGED, _DIVERGED, -_DIVERGED).clamp(-_DIVERGED, _DIVERGED)
+    )
 
 
 def _clearly_larger(errors: Tensor, lowest: Tensor) -> bool:
@@ -360,6 +361,20 @@ def _clearly_larger(errors: Tensor, lowest: Tensor) -> bool:
     noise = scipy.stats.t.ppf(_LEVEL, freedom) * excess.std(correction=0) / freedom**0.5
     # A single diverged part has a mean of one standard error, which is not significant.
     return bool(excess.mean() > min(noise, _NOISE * lowest.mean()))
+
+
+def _longer(trajectories: Sequence[Trajectory], windows: Windows) -> list[Windows]:
+    """Return windows that double their length and halve their number, up to half a trajectory."""
+    stride = round(float(windows.t[1] / trajectories[0].t.diff()[0]))
+    longest, steps = max(len(item.t) for item in trajectories) // 2, 2 * (len(windows.t) - 1)
+    count, drawn = len(windows) // 2, []
+    draw = partial(
+        draw_windows, list(trajectories), stride=stride, history=-float(windows.input.t[0]), seed=0
+    )
+    while steps * stride <= longest and count >= _FEWEST_WINDOWS:
+        drawn.append(draw(count=count, steps=steps).to(torch.device("cpu"), torch.float64))
+        steps, count = 2 * steps, count // 2
+    return drawn
 
 
 def _speeds(v: Tensor) -> Tensor:

@@ -214,7 +214,7 @@ def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
         time.sleep(600)
 
     with log.open("w") as output, monkeypatch.context() as patch:
-        patch.setattr("pinn_dyn.training.least_squares.rollout_slopes", endless)
+        patch.setattr("pinn_dyn.training.sensitivity.WindowRollouts.increments", endless)
         short = ["optimizer.samples=200", "optimizer.evaluations=5"]
         words = [*KNOWN, *WINDOWS, *short, f"hydra.run.dir={folder}"]
         process = fork_script("train.py", *words, folder=tmp_path, output=output)

@@ -3,7 +3,7 @@
 import torch
 
 from pinn_dyn.ensembles import posterior_draws
-from pinn_dyn.training.sensitivity import rollout_slopes
+from pinn_dyn.training.sensitivity import WindowRollouts
 from tests.support.known import known_model, windows_of
 
 
@@ -20,7 +20,7 @@ def test_the_spread_of_predictions_is_that_of_the_linear_problem():
     with torch.no_grad():
         found = members.member_increments(windows.start("qv"), windows.t, windows.input)[:, :, 1:]
         middle = model.increments(windows.start("qv"), windows.t, windows.input)[:, 1:]
-    slope = rollout_slopes(model, windows)
+    slope = WindowRollouts(model, windows).slopes()
     expected = (slope @ covariance * slope).sum(-1).sqrt()
     torch.testing.assert_close(found.std(0), expected, rtol=0.1, atol=0)
     assert ((found.mean(0) - middle).abs() < 0.2 * expected).all()
