@@ -175,63 +175,116 @@ def check(
     rigid = regressor(structure) if structure is not None and square else None
     delays = logs.input_delays(training, longest=longest_delay, rigid=rigid)
     faults, delays = input_faults(training, delays, source.u, step, rigid)
-    coordinates = _coordinates(source, training, splits.test)
-    noise = coordinates["noise of q"].to_numpy()
-    highest = numbers.bandwidth(training, step, noise)
     everything = [item for x in source.cleaned for item in x.clean]
     columns = source.q, source.u
     motion, equations = logs.equations_of_motion(
         everything, *columns, step, curves=delays, rigid=rigid
     )
-    after = logs.check_runs(everything, *columns, step, curves=delays, rigid=rigid)
+    runs = logs.check_runs(everything, *columns, motion, equations, curves=delays, rigid=rigid)
     # A fault of an input explains runs that differ, and signs.
-    if any(x.verdict != "ok" for x in faults):
-        after = []
-    names = {logs.RESIDUAL, logs.INERTIA}
-    before = [x for x in source.measurements if x.name not in names]
-    measurements = [*before, *after, *faults, *_limited(coordinates)]
-    if structure is not None:
-        measurements += compare_structure(structure, training, delays, source.u, step)
-    if inputs:
-        share = numbers.explained_share(training, delays, step)
-        text = (
-            f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
-            "inputs of this robot, on the same clock?"
-        )
-        name, bad = "share of the motion that inputs add to (1, q, v)", share < _EXPLAINED
-        expected = f"at least {_EXPLAINED}"
-        measurements.append(_judged(name, "inputs", share, expected, bad, text, "stop"))
-    same_units = source.u.units[: len(source.q.units)] == source.q.units
-    angles = [unit == "rad" for unit in source.q.units]
-    fast = (coordinates["fastest [/s]"] * step > _TURNED)[angles].any()
-    servo = same_units and numbers.target_distance(training, step, longest_delay) < _TARGET
+    runs = [] if any(x.verdict != "ok" for x in faults) else runs
+    before = [x for x in source.measurements if x.name not in {logs.RESIDUAL, logs.INERTIA}]
+    coordinates = _coordinates(source, training, splits.test)
+    highest = numbers.bandwidth(training, step, coordinates["noise of q"].to_numpy())
+    servo = _follows_targets(source, training, step, longest_delay)
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else logs.clear_delays(delays, step)
+    measurements = [*before, *runs, *faults, *_limited(coordinates)]
+    measurements += _inputs_measured(source, training, delays, clear, step)
+    excitation = None
+    if structure is not None:
+        measurements += compare_structure(structure, training, delays, source.u, step)
+        excitation = _excitation(structure, splits.train, coordinates, highest, step)
+        measurements.append(_condition(excitation))
+    dry = any(x.dry for x in delays)
+    # A filter smears reversals of dry friction.
+    filtered = not (dry and source.v is not None)
+    angles = [unit == "rad" for unit in source.q.units]
+    fast = (coordinates["fastest [/s]"] * step > _TURNED)[angles].any()
+    options = ["model/input=servo", "model/integrator=rosenbrock"] * servo
+    options += ["model/friction=coulomb"] * dry
+    return LogCheck(
+        source=source,
+        measurements=measurements,
+        runs=pd.DataFrame([_run(part) for part in source.cleaned]),
+        coordinates=coordinates,
+        inputs=_inputs_table(source, training, delays),
+        delays=delays,
+        steps=_filter(source, training, step, coordinates, highest) if filtered else [],
+        delay=_delay(source, clear),
+        options=[] if fast else options,
+        rigid=excitation,
+        motion=motion,
+        equations=equations,
+    )
+
+
+def _follows_targets(
+    source: logs.LogSource, training: list[logs.Recording], step: float, longest: float
+) -> bool:
+    """Tell whether the inputs are targets that the coordinates follow."""
+    same_units = source.u.units[: len(source.q.units)] == source.q.units
+    return same_units and numbers.target_distance(training, step, longest) < _TARGET
+
+
+def _inputs_measured(
+    source: logs.LogSource,
+    training: list[logs.Recording],
+    delays: Sequence[logs.DelayCurve],
+    clear: Sequence[float],
+    step: float,
+) -> list[Measurement]:
+    """Measure the share of the motion that the inputs explain, and their delays."""
+    if not delays:
+        return []
+    share = numbers.explained_share(training, delays, step)
+    text = (
+        f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
+        "inputs of this robot, on the same clock?"
+    )
+    name, bad = "share of the motion that inputs add to (1, q, v)", share < _EXPLAINED
+    expected = f"at least {_EXPLAINED}"
+    results = [_judged(name, "inputs", share, expected, bad, text, "stop")]
     for name, curve, lag in zip(source.u.columns, delays, clear, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
         text = (
             f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the delay below to "
             "the data set"
         )
-        measurements.append(_judged("delay [ms]", name, delay, "no clear delay", lag > 0, text))
-    excitation = None
-    if structure is not None:
-        longest = max(item.duration for item in splits.train)
-        # At least three periods of the cutoff are in the longest motion.
-        cutoff = min(max(4 * highest, 1.0, 3.01 / longest), 0.4 / step)
-        still = (coordinates["noise / range"] > _STILL).tolist()
-        excitation = rigid_excitation(structure, splits.train, cutoff=cutoff, still=still)
-        condition, open_joints = excitation.condition, ", ".join(excitation.open_joints)
-        text = (
-            f"the rigid-body regressor has the condition number {condition:.3g}: these motions do "
-            f"not determine constants of {open_joints}; use more frequencies, poses and speeds"
-        )
-        name = f"condition number of {excitation.count} base parameters"
-        bad, expected = condition > MOST, f"below {MOST:g}"
-        measurements.append(_judged(name, "training", condition, expected, bad, text))
+        results.append(_judged("delay [ms]", name, delay, "no clear delay", lag > 0, text))
+    return results
+
+
+def _excitation(
+    structure: Structure,
+    motions: Sequence[Trajectory],
+    coordinates: pd.DataFrame,
+    highest: float,
+    step: float,
+) -> RigidExcitation:
+    longest = max(item.duration for item in motions)
+    # At least three periods of the cutoff are in the longest motion.
+    cutoff = min(max(4 * highest, 1.0, 3.01 / longest), 0.4 / step)
+    still = (coordinates["noise / range"] > _STILL).tolist()
+    return rigid_excitation(structure, motions, cutoff=cutoff, still=still)
+
+
+def _condition(excitation: RigidExcitation) -> Measurement:
+    condition, open_joints = excitation.condition, ", ".join(excitation.open_joints)
+    text = (
+        f"the rigid-body regressor has the condition number {condition:.3g}: these motions do "
+        f"not determine constants of {open_joints}; use more frequencies, poses and speeds"
+    )
+    name = f"condition number of {excitation.count} base parameters"
+    return _judged(name, "training", condition, f"below {MOST:g}", condition > MOST, text)
+
+
+def _inputs_table(
+    source: logs.LogSource, training: list[logs.Recording], delays: Sequence[logs.DelayCurve]
+) -> pd.DataFrame:
     u = np.vstack([item.u for item in training])
     table = {
-        "input": source.input_labels[:inputs],
+        "input": source.input_labels[: len(delays)],
         "min": u.min(axis=0),
         "max": u.max(axis=0),
         "delay [ms]": [np.nan if x.delay is None else 1e3 * x.delay for x in delays],
@@ -239,25 +292,7 @@ def check(
         "dry friction": [x.friction for x in delays],
         "method": [x.reason or x.form for x in delays],
     }
-    dry = any(x.dry for x in delays)
-    sharp = dry and source.v is not None  # a filter smears reversals of dry friction
-    return LogCheck(
-        source,
-        measurements,
-        pd.DataFrame([_run(part) for part in source.cleaned]),
-        coordinates,
-        pd.DataFrame(table),
-        delays,
-        [] if sharp else _filter(source, training, step, noise, highest),
-        _delay(source, clear),
-        []
-        if fast
-        else ["model/input=servo", "model/integrator=rosenbrock"] * servo
-        + ["model/friction=coulomb"] * dry,
-        excitation,
-        motion,
-        equations,
-    )
+    return pd.DataFrame(table)
 
 
 def _cause(text: str) -> str:
@@ -313,9 +348,10 @@ def _filter(
     source: logs.LogSource,
     training: list[logs.Recording],
     step: float,
-    noise: np.ndarray,
+    coordinates: pd.DataFrame,
     highest: float,
 ) -> list[str]:
+    noise = coordinates["noise of q"].to_numpy()
     v = np.vstack([np.diff(item.q, axis=0) / step for item in training])
     share = float((2**0.5 * noise / step / v.std(axis=0).clip(min=1e-300)).max())
     cutoff = float(f"{max(4 * highest, 1.0):.2g}")

@@ -110,17 +110,17 @@ def check_runs(
     recordings: Sequence[Recording],
     q: Columns,
     u: Columns,
-    step: float,
+    data: Averages | None,
+    equations: Sequence[Equation],
     *,
     curves: Sequence[DelayCurve] = (),
     rigid: Regressor | None = None,
 ) -> list[Measurement]:
     """Compare each run with the equation of the others, and measure the signs of the forces.
 
-    Fewer than three runs, or too few rows for the terms, are not compared. The arguments are those
-    of :func:`equations_of_motion`.
+    Fewer than three runs, or too few rows for the terms, are not compared. ``data`` and
+    ``equations`` are those of :func:`equations_of_motion` for the other arguments.
     """
-    data, equations = equations_of_motion(recordings, q, u, step, curves=curves, rigid=rigid)
     if data is None or not equations:
         return []
     results, inverse = [], len(u.columns) <= len(q.columns)

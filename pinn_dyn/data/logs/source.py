@@ -24,7 +24,7 @@ from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summa
 from pinn_dyn.data.logs.reading import Layout
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.repeats import check_repeats
-from pinn_dyn.data.logs.runs import check_runs
+from pinn_dyn.data.logs.runs import check_runs, equations_of_motion
 from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.step import Step
@@ -243,7 +243,8 @@ class LogSource(DataSource):
         if self.v is not None:
             measurements += plausibility.check_velocities(everything, self.q, self.v, step)
             measurements += plausibility.check_velocity_lag(everything, self.q, self.v, step)
-        measurements += check_runs(everything, self.q, self.u, step)
+        motion = equations_of_motion(everything, self.q, self.u, step)
+        measurements += check_runs(everything, self.q, self.u, *motion)
         measurements += plausibility.check_inputs(training, self.q, self.u)
         measurements += plausibility.check_rest(stretches, self.q)
         report.add("Splits", "train", summary(training, step))
