@@ -70,9 +70,10 @@ def input_faults(
         best = int(shares[i].argmin())
         drift = 100 * drifts[best - edges[0]] if drifting else 0.0
         text = (
-            f"the clock of input {name!r} is {abs(drift):.2g} % {'slow' if drift > 0 else 'fast'}: "
-            f"its shift grows to {abs(drift) * 10 * duration:.3g} ms, which no constant delay "
-            "repairs; log it with the clock of q, or correct its times"
+            f"the clock of input {name!r} drifts by {abs(drift):.2g} % against that of q: at "
+            f"{duration:.3g} s it is {abs(drift) * 10 * duration:.3g} ms too "
+            f"{'late' if drift > 0 else 'early'}, which no constant delay repairs; log it with the "
+            "clock of q, or correct its times"
         )
         results.append(judged("clock drift [%]", name, abs(drift), "0", drifting, text))
         level = levels[best - edges[1], i] if saturated else np.inf

@@ -212,6 +212,8 @@ def _cause(
         effect = x.columns["inputs"][rows] @ theta[-u.shape[1] :]
         measured, predicted = effect, measured - predicted + effect
         name = f"the effect of the inputs on {labels[j]!r}"
+    # The mean of a torque in another unit is far from that of the other runs.
+    measured, predicted = (x - x.mean(axis=0) for x in (measured, predicted))
     sizes = (np.linalg.norm(x, axis=0).clip(min=1e-300) for x in (measured, predicted))
     product = measured.T @ predicted
     match = product / np.outer(*sizes)
