@@ -164,16 +164,6 @@ def test_a_fit_with_rollouts_has_its_identification_beside_it(tmp_path):
     assert identified["error_mean"] != rolled["error_mean"]
 
 
-@pytest.mark.slow
-def test_a_run_that_keeps_its_identification_has_its_constants(tmp_path, fitted):
-    folder = tmp_path / "both"
-    run_script("train.py", *KNOWN, *WINDOWS, f"hydra.run.dir={folder}")
-    assert json.loads((folder / "metrics.json").read_text())["stage"] == "inverse dynamics"
-    expected, table = (pd.read_csv(place / "constants.csv") for place in (fitted, folder))
-    pd.testing.assert_frame_equal(table, expected)
-    torch.testing.assert_close(pinn_dyn.load(folder).covariance, pinn_dyn.load(fitted).covariance)
-
-
 FORGED = {
     "none": (lambda c: None, "has no covariance of its constants"),
     "of another": (lambda c: c[:3, :3], "the earlier fit has 3 constants, this model"),
