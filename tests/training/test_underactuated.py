@@ -32,7 +32,7 @@ def assert_found(arm, model, error):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_joint_without_a_motor_does_not_collapse(name):
-    """Zero bodies would explain zero torque. Noise of the filtered motion biases the acrobot most."""
+    """Zero bodies would explain zero torque. Noise of the motion biases the acrobot most."""
     arm = ROBOTS[name]
     runs = []
     for _, run in log(arm, 2).groupby("run"):
