@@ -224,13 +224,15 @@ def _scales(structure: RigidChain, data: Averages, u: Columns) -> list[Measureme
     results = []
     for i, joint in enumerate(structure.joint_names):
         rows = data.moving[:, i]
+        if rows.sum() < _ROWS // 10:
+            continue
         columns = {
             "bodies": bodies[rows, i],
             "drive": np.column_stack([data.a[rows, i], data.v[rows, i], np.ones(rows.sum())]),
             "sign": data.sign[rows, i],
             "y": data.u[rows, 0, i],
         }
-        blocks = np.arange(rows.sum()) * 10 // max(rows.sum(), 1)
+        blocks = np.arange(rows.sum()) * 10 // rows.sum()
         regression = EquationOfMotionRegression(columns, blocks)
         fit = regression.fit("y", ["bodies", "drive", "sign"], regression.jackknife())
         scale, parts = float(fit.theta[0, 0, 0]), fit.theta[1:, 0, 0]

@@ -137,7 +137,8 @@ def _topic(
     stays = ~zero & ~foreign & (publishers == usual)
     frame = pd.DataFrame(values, times, columns).assign(**{_RECEIVED: received})[stays]
     for name in (columns[k] for k in signals if len(frame) > _FEW):
-        if alternates(frame[name].to_numpy()):
+        measured = {"position", "velocity"} & set(name.split("/"))  # commands may alternate
+        if measured and alternates(frame[name].to_numpy()):
             raise LogError(
                 f"{path}: {name!r} goes to and fro from message to message: two nodes publish "
                 f"{topic}, and the bag does not record which. Stop or remap one, and record again"

@@ -31,7 +31,8 @@ _SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 
 _UNEXPLAINED = 0.4  # largest residual
 _WORSE = 2.0  # residual over that of the best equation of motion, beyond which it is left out
 _GROUPS = 10  # of the data that the jackknife leaves out in turn
-_FEWEST = 20 * _GROUPS  # rows
+FEWEST = 20 * _GROUPS
+"""Smallest number of rows of a regression."""
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
 _ONE_LINE = 0.995  # of the power of a signal
@@ -92,7 +93,7 @@ def input_delays(
     parts = [with_products(x) for x in recordings] if inputs > size else recordings
     widths = sorted({max(width, 1.5 * step) for width in _WIDTHS})
     trials = [Averages.of(parts, step, width, lags) for width in widths]
-    enough = [data for data in trials if data is not None and len(data.t) >= _FEWEST]
+    enough = [data for data in trials if data is not None and len(data.t) >= FEWEST]
     if not enough:
         short = "the stretches are too short"
         return [DelayCurve(lags * step, np.ones(len(lags)), None, np.inf, "none", short)] * inputs
@@ -198,7 +199,7 @@ def _input_curve(
     """Return the curve of input i by inverse dynamics, generic or of rigid bodies."""
     moving = data.moving_rows(i, inputs)
     form = _INVERSE if rigid is None else _RIGID
-    if moving.sum() < _FEWEST:
+    if moving.sum() < FEWEST:
         ones = np.ones(len(candidates))
         return DelayCurve(candidates, ones, None, np.inf, form, "the joint hardly moves")
     data = data.rows(moving)

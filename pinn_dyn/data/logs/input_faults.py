@@ -9,7 +9,7 @@ import numpy as np
 
 from pinn_dyn.data.logs.averages import Averages
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay import DelayCurve, force_columns
+from pinn_dyn.data.logs.delay import FEWEST, DelayCurve, force_columns
 from pinn_dyn.data.logs.equation import EquationOfMotionRegression, Regressor
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
@@ -122,6 +122,9 @@ def _shares(
     results = []
     for i in range(len(curves)):
         rows = data.rows(data.moving_rows(i, len(curves)))
+        if len(rows.t) < FEWEST:
+            results.append(np.ones(count))
+            continue
         explained = force_columns(rows, i, rigid)
         y = rows.u[:, 0, i * count : (i + 1) * count]
         y = y - y.mean(axis=0)

@@ -28,6 +28,7 @@ _PER_TERM = 6  # rows at least
 _RESIDUAL, _RATIO = 0.3, 3.0  # of a bad run: share of the signal, and of the median run's residual
 _CLEAR = 0.9  # correlation from which a scale is clear
 _SCALES = (0.55, 1.8)  # of another load; beyond, another unit
+_NOTICEABLE = 0.05  # share of a force from which its inertial part is judged
 _FORCES = {"Nm", "N", "A"}  # units of inputs that push their joint forward
 
 
@@ -260,7 +261,8 @@ def _signs(
         change = np.hstack([pushed[key] for key in equation.x]) - x
         inertia = change @ fit.theta[0, :, 0]
         left = columns["y"][:, 0] - x @ fit.theta[0, :, 0]
-        clear = np.std(inertia * data.a[:, k]) > 2 * np.std(left)
+        smallest = max(2 * np.std(left), _NOTICEABLE * np.std(columns["y"]))
+        clear = np.std(inertia * data.a[:, k]) > smallest
         positive = weights @ (inertia > 0) / weights.sum()
         bad = bool(clear and positive < 0.1 and shares[k] < (0.2 if square else -0.2))
         curve = curves[i] if curves and square else None
