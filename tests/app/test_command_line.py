@@ -57,7 +57,7 @@ def test_a_misspelt_key_is_answered_with_the_right_one(elsewhere, script, mistak
 
 
 def test_paths_of_run_folders_need_no_key(elsewhere):
-    """What everyone types first, and what a shell makes of runs/*."""
+    """Paths of runs without a key, as typed or as a shell expands runs/*."""
     paths = ["runs/a", "runs/it has, commas"]
     assert composed("evaluate", ["horizon=1", *paths])["runs"] == paths
     assert completed("control", ["runs/a"]) == ["++run='runs/a'"]

@@ -57,7 +57,7 @@ def unread(monkeypatch):
 @pytest.mark.usefixtures("unread")
 @pytest.mark.parametrize("encoding", [None, "utf-8", "utf-16"])
 def test_no_mjcf_of_a_run_folder_is_read(tmp_path, lnn_run, encoding):
-    """As text, or as a file that the configuration names."""
+    """An MJCF as text, or as a file that the configuration names."""
     file = tmp_path / "robot.xml"
     file.write_bytes(f" {ENDLESS}".encode(encoding or "utf-8"))
     structure = {

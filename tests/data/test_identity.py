@@ -73,7 +73,7 @@ def test_a_changed_number_is_found(signal, size, sign):
 
 
 def test_other_times_of_the_same_samples_are_found():
-    """As after a corrected unit of the time, with measured velocities."""
+    """The same samples at other times, as after a corrected unit of the time."""
 
     def slower(splits):
         motion = splits["train"][1]
