@@ -92,7 +92,7 @@ def test_the_command_for_a_xacro_file_makes_a_robot_that_loads(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "my arm.urdf.xacro"
     path.write_text(
-        ARM.replace("<link", '<xacro:property xmlns:xacro="http://wiki.ros.org/xacro"/><link', 1)
+        ARM.replace("<link", '<xacro:arm xmlns:xacro="http://wiki.ros.org/xacro"/><link', 1)
     )
     (tmp_path / "plain.urdf").write_text(ARM)
     program = tmp_path / "xacro"

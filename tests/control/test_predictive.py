@@ -228,8 +228,8 @@ def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
     assert not law(0.0, *broken, goal).any()  # nothing was applied before
 
 
-def test_times_limits_and_references_that_are_not_numbers_are_named(law):
-    law.reset()
+def test_times_limits_and_references_that_are_not_numbers_are_named():
+    law = PredictiveControl(Pendulum(), 0.6, STEP)
     state, goal = [double([[0.1]]), double([[0.0]])], SetPoint([1.0])(0.0)
     with pytest.raises(ValueError, match="t is nan, expected the time of the call in s"):
         law(np.nan, *state, goal)
