@@ -73,7 +73,9 @@ class LeastSquares:
        at rest are excluded, since dry friction may then have any value up to its level. If a joint
        has no input, r is the error of the acceleration instead: zero bodies would have no error of
        the force at such a joint. Without any input, no common factor of the forces changes the
-       motion, and the mass of the last body stays that of the prior.
+       motion, and the mass of the last body stays that of the prior. If the force is not linear
+       in the input, as for a servo that saturates, rollouts start from the prior: the force at
+       the filtered input is not the filtered force.
     2. Rollouts: r = predicted minus measured increments of the windows, in units of their spread,
        as in the increment loss. The first rollouts use a quarter of the steps of the windows. While
        a stage lowers the validation error by 5 %, windows of twice the length and half the number
@@ -146,7 +148,9 @@ class LeastSquares:
         prior = stopped.prior if stopped else self._prior(model, covariance)
         earlier = covariance is not None
         growth: list[Windows] = []
-        stages = {IDENTIFICATION: partial(self._identify, model, prior, trajectories, earlier)}
+        stages = {}
+        if model.input_affine or not self.rollouts:
+            stages[IDENTIFICATION] = partial(self._identify, model, prior, trajectories, earlier)
         if self.rollouts:
             assert windows is not None
             windows = windows.to(torch.device("cpu"), torch.float64)

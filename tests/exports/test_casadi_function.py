@@ -20,7 +20,9 @@ def test_terms_are_matrices_and_survive_a_file(tmp_path):
     path = tmp_path / "terms.casadi"
     calls = write_casadi([exported], path, "", "double")
     loaded = casadi.Function.load(str(path))(q.numpy())
-    for matrix, again, term in zip(loaded, calls["terms"](q[None].numpy()), model.terms(q), strict=True):
+    for matrix, again, term in zip(
+        loaded, calls["terms"](q[None].numpy()), model.terms(q), strict=True
+    ):
         np.testing.assert_allclose(np.array(matrix).reshape(term.shape), term, 1e-9)
         np.testing.assert_array_equal(np.array(matrix), again[0])
 
