@@ -5,14 +5,18 @@ from __future__ import annotations
 import inspect
 import os
 import pkgutil
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 from pinn_dyn.app.config import ConfigError, build_part, composed
-from pinn_dyn.app.run import ModelBuilder
 from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource
+from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
+from pinn_dyn.models import Statistics
+
+ModelBuilder = Callable[..., Predictor]
+"""Builder of a model, called with ``statistics=``."""
 
 
 def build_source(config: dict[str, Any]) -> DataSource:
@@ -39,34 +43,21 @@ def model_builder(config: dict[str, Any]) -> ModelBuilder:
     return build_part("model", config["model"], partial_=True)
 
 
-def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Build the arguments of :func:`~pinn_dyn.train` from the configuration of train.py."""
-    from pinn_dyn.app.trainer import tensorboard  # imports Lightning, which takes seconds
+def build_predictor(
+    model: ModelBuilder | Predictor, statistics: Statistics, seed: int, ensemble: int = 1
+) -> Predictor:
+    """Build the model, or an ensemble of models of the seeds seed, seed + 1, ..."""
+    from lightning import seed_everything  # takes seconds to import
 
-    optimizer = config["optimizer"]
-    settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
-    builders = ("data", "loss", "scheduler", "validator")
-    return {
-        "source": build_source(config),
-        "model": model_builder(config),
-        **{name: build_part(name, config[name], partial_=True) for name in builders},
-        "optimizer": build_part("optimizer", optimizer, partial_=optimizer.get("_partial_", False)),
-        "steps": settings.pop("steps"),
-        "validations": settings.pop("validations"),
-        "trainer": settings,
-        "callbacks": [
-            build_part(f"callbacks.{name}", part)
-            for name, part in config["callbacks"].items()
-            if part is not None
-        ],
-        "loggers": [
-            tensorboard(folder)
-            if name == "tensorboard"
-            else build_part(f"logger.{name}", part, save_dir=str(folder))
-            for name, part in config["logger"].items()
-        ],
-        **{name: config[name] for name in ("seed", "ensemble", "compile", "threads")},
-    }
+    if isinstance(model, Predictor):
+        return model
+    if ensemble == 1:
+        return model(statistics=statistics)
+    members = []
+    for k in range(ensemble):
+        seed_everything(seed + k, verbose=False)
+        members.append(model(statistics=statistics))
+    return Ensemble(members)
 
 
 def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 
-from pinn_dyn.app.build import model_builder
-from pinn_dyn.app.config import ConfigError, build_part
+from torch.nn.utils import vector_to_parameters
+
+from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import flattened, require_same_data
@@ -15,7 +16,7 @@ from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
-from pinn_dyn.mechanics import Predictor, stack_until
+from pinn_dyn.mechanics import double_copy, stack_until
 from pinn_dyn.progress import Progress
 from pinn_dyn.training.least_squares import IDENTIFICATION
 
@@ -107,8 +108,10 @@ def evaluate(
         baselines = [Entry(name, x, training, grid, name) for name, x in predictors.items()]
         for model, run, trained_on, own_step in zip(models, runs, sources, steps, strict=True):
             name = f"identification of {model}"
-            if _is_rolled_out(run) and name not in {entry.run for entry in baselines}:
-                identified = _identified(run, trained_on)
+            z = None if run.metrics.get("stage") == IDENTIFICATION else run.identified
+            if z is not None and name not in {entry.run for entry in baselines}:
+                identified = double_copy(run.model)  # before the rollouts
+                vector_to_parameters(z.double(), identified.parameters())
                 baselines.append(Entry(name, identified, splits[trained_on], own_step, name))
         evaluation = evaluate_models(
             entries,
@@ -124,19 +127,6 @@ def evaluate(
     folders = {name: run.folder for name, run in zip(names, runs, strict=True)}
     evaluation.constants = read_constants(folders)
     return evaluation
-
-
-def _is_rolled_out(run: Run) -> bool:
-    fitted = run.covariance is not None and run.config.get("start_from") is None
-    return fitted and run.metrics.get("stage") != IDENTIFICATION
-
-
-def _identified(run: Run, source: DataSource) -> Predictor:
-    """Repeat the first stage of a fit: identification by inverse dynamics, without rollouts."""
-    model = model_builder(run.config)(statistics=run.statistics)
-    solver = build_part("optimizer", {**run.config["optimizer"], "rollouts": False})
-    solver.fit(model, source.load().train)
-    return model
 
 
 def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:

@@ -9,7 +9,8 @@ from typing import Any
 import pandas as pd
 from pydantic import PositiveInt
 
-from pinn_dyn.app.run import ModelBuilder, Run
+from pinn_dyn.app.build import ModelBuilder
+from pinn_dyn.app.run import Run
 from pinn_dyn.app.training import train
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs.step import Step

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +17,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pinn_dyn.app.build import build_source
 from pinn_dyn.app.export import export
 from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
+from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.evaluation.payload import identify_payload
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.exported import Real
@@ -35,15 +37,10 @@ from pinn_dyn.mechanics import (
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
 
-VALIDATION_ERROR = "val/error_mean"
-"""Metric that summarizes a training; sweeps minimize it."""
-BEST_BY = "val/error_windowed"
-"""Metric that chooses the best checkpoint. A long rollout may err least before it learns."""
 TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""
 
 Values = ArrayLike | Tensor
-ModelBuilder = Callable[..., Predictor]
 
 
 class TermArrays(NamedTuple):
@@ -71,6 +68,7 @@ class Run:
         data: identity of the data, see :func:`~pinn_dyn.data.data_identity`; empty if unknown.
         finished: whether the training has ended.
         covariance: covariance of constants that least squares fitted, ``(P, P)``, or None.
+        identified: standardized constants before the rollouts of least squares, ``(P,)``, or None.
     """
 
     folder: Path
@@ -81,6 +79,7 @@ class Run:
     data: dict[str, Any]
     finished: bool = True
     covariance: Tensor | None = None
+    identified: Tensor | None = None
     _made_in_python: DataSource | None = None
     _temporary: TemporaryDirectory[str] | None = None
     _may_simulate: bool = True
@@ -97,8 +96,6 @@ class Run:
     @cached_property
     def source(self) -> DataSource:
         """The data that the run was trained on."""
-        from pinn_dyn.app.build import build_source
-
         source = self._made_in_python or build_source(self.config)
         if isinstance(source, RobotSource):
             source.may_simulate = self._may_simulate
@@ -107,8 +104,6 @@ class Run:
     @cached_property
     def log(self) -> LogSource | None:
         """The log that the run was trained on; None without a log."""
-        from pinn_dyn.app.build import build_source
-
         if isinstance(self._made_in_python, LogSource):
             return self._made_in_python
         part = self.config.get("log") or self.config["dataset"]
@@ -185,8 +180,6 @@ class Run:
             TypeError: if the model has no bodies.
             ValueError: if the data cannot be used.
         """
-        from pinn_dyn.app.build import build_source
-
         if not isinstance(self.model, KnownMechanics):
             kind = type(self.model).__name__
             raise TypeError(f"a {kind} has no bodies that carry a load: use a run of model=known")

@@ -17,8 +17,9 @@ from filelock import FileLock, Timeout
 from lightning.pytorch.utilities.seed import isolate_rng
 
 from pinn_dyn import __version__
+from pinn_dyn.app.build import ModelBuilder, build_predictor, model_builder
 from pinn_dyn.app.config import ConfigError, write_config
-from pinn_dyn.app.run import ModelBuilder, Run
+from pinn_dyn.app.run import Run
 from pinn_dyn.app.trust import is_trusted, packages, require_trusted
 from pinn_dyn.data import data_changes
 from pinn_dyn.data.whole import write_whole
@@ -28,7 +29,7 @@ from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import set_output_limits
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
-from pinn_dyn.training import COVARIANCE, WholeCheckpoints
+from pinn_dyn.training import COVARIANCE, FIT, WholeCheckpoints
 
 METRICS, CHECKPOINTS = "metrics.json", "checkpoints"
 RECORD, DATA, FINISHED = "record", "data", "finished"
@@ -70,9 +71,6 @@ def load_run(
     model: ModelBuilder | None = None,
 ) -> Run:
     """Load a run as :func:`load` does; ``trust=None`` trusts all classes that the run names."""
-    from pinn_dyn.app.build import model_builder
-    from pinn_dyn.app.training import build_predictor
-
     path = folder / CHECKPOINTS / f"{checkpoint}.ckpt"
     saved = read_checkpoint(path)
     config = saved["hyper_parameters"]["config"]
@@ -105,6 +103,7 @@ def load_run(
         saved.get(DATA, {}),
         bool(saved.get(FINISHED)),
         covariance if isinstance(covariance, torch.Tensor) else None,
+        saved.get(FIT, {}).get("identified"),
         _may_simulate=trust is None or is_trusted(robot, trust),
     )
 

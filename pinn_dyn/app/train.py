@@ -13,9 +13,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from pinn_dyn.app import training
-from pinn_dyn.app.build import training_arguments
-from pinn_dyn.app.config import ConfigError, checked
-from pinn_dyn.app.run import VALIDATION_ERROR
+from pinn_dyn.app.build import build_source, model_builder
+from pinn_dyn.app.config import ConfigError, build_part, checked
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
     load_run,
@@ -24,8 +23,10 @@ from pinn_dyn.app.run_folder import (
     require_no_links_out,
 )
 from pinn_dyn.app.sweep import resume_command
+from pinn_dyn.app.trainer import tensorboard
 from pinn_dyn.app.trust import check_name, packages, require_trusted
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +75,34 @@ def train(cfg: DictConfig) -> float:
         text = load.to_string(index=False, na_rep="", float_format="{:.4g}".format)
         print(f"Load in the frame of {load.attrs['frame']}, inertia about its center:\n{text}")
     return run.metrics["validation"].get(VALIDATION_ERROR, math.nan)
+
+
+def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Build the arguments of :func:`~pinn_dyn.train` from the configuration of train.py."""
+    optimizer = config["optimizer"]
+    settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
+    builders = ("data", "loss", "scheduler", "validator")
+    return {
+        "source": build_source(config),
+        "model": model_builder(config),
+        **{name: build_part(name, config[name], partial_=True) for name in builders},
+        "optimizer": build_part("optimizer", optimizer, partial_=optimizer.get("_partial_", False)),
+        "steps": settings.pop("steps"),
+        "validations": settings.pop("validations"),
+        "trainer": settings,
+        "callbacks": [
+            build_part(f"callbacks.{name}", part)
+            for name, part in config["callbacks"].items()
+            if part is not None
+        ],
+        "loggers": [
+            tensorboard(folder)
+            if name == "tensorboard"
+            else build_part(f"logger.{name}", part, save_dir=str(folder))
+            for name, part in config["logger"].items()
+        ],
+        **{name: config[name] for name in ("seed", "ensemble", "compile", "threads")},
+    }
 
 
 def _recorded(folder: Path, trust: tuple[str, ...]) -> dict[str, Any]:

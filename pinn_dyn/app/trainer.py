@@ -19,11 +19,11 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.app.config import ConfigError, naming
-from pinn_dyn.app.run import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD, flattened
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.evaluation.metrics import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics

@@ -6,7 +6,7 @@ import contextlib
 import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,13 +20,14 @@ from pydantic import PositiveInt
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from pinn_dyn.app.build import ModelBuilder, build_predictor
 from pinn_dyn.app.command import hush
 from pinn_dyn.app.config import ConfigError, naming
 from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.described import described
 from pinn_dyn.app.known_data import check_known, match_model, warn_of_structure
 from pinn_dyn.app.provenance import provenance
-from pinn_dyn.app.run import TRAJECTORIES, VALIDATION_ERROR, ModelBuilder, Run
+from pinn_dyn.app.run import TRAJECTORIES, Run
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
     DATA,
@@ -57,6 +58,7 @@ from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
+from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import (
     AccelerationMLP,
@@ -190,7 +192,6 @@ def train(
     if folder is None:
         temporary = TemporaryDirectory(prefix="pinn_dyn-")
         folder, callbacks = temporary.name, callbacks or ()
-    run_folder = Path(folder).expanduser()
     is_log = isinstance(source, LogSource)
     data = data or _windows(source, model, optimizer)
     steps = steps or (LOG_STEPS if is_log else STEPS)
@@ -213,23 +214,32 @@ def train(
         validator=validator,
     )
     if config is None:
-        factory = model.func if isinstance(model, partial) else model
-        name = model_name or getattr(factory, "__name__", type(factory).__name__)
-        config = {
-            "name": f"{source.name}/{name}",
-            "model_name": name,
-            "seed": seed,
-            "compile": compile,
-            "ensemble": ensemble,
-            "threads": threads,
-            **({} if start_from is None else {"start_from": str(start_from.folder)}),
-            **_description(source),
-            **_model_description(model),
-            **{name: described(part) for name, part in parts.items()},
-            "trainer": {"steps": steps, "validations": validations, **trainer},
-        }
+        settings: dict[str, Any] = dict(
+            seed=seed, compile=compile, ensemble=ensemble, threads=threads
+        )
+        if start_from is not None:
+            settings["start_from"] = str(start_from.folder)
+        settings["trainer"] = {"steps": steps, "validations": validations, **trainer}
+        config = _description(source, model, model_name, parts) | settings
     config = merged(with_structures(config), {"model": changes} if changes else {})
-    store_to = run_folder / TRAJECTORIES if made_in_python and temporary is None else None
+    run_folder = Path(folder).expanduser()
+    job = _Job(
+        folder=run_folder,
+        source=source,
+        model=model,
+        parts=parts,
+        config=config,
+        seed=seed,
+        ensemble=ensemble,
+        steps=steps,
+        validations=validations,
+        compile=compile,
+        trainer=trainer,
+        callbacks=callbacks,
+        loggers=loggers,
+        start_from=start_from,
+        keeps_data=made_in_python and temporary is None,
+    )
     try:
         with contextlib.ExitStack() as stack:
             stack.callback(torch.set_num_threads, torch.get_num_threads())
@@ -241,28 +251,7 @@ def train(
                 _same_data(source, run_folder, saved)
                 log.info("already trained: %s is loaded; overwrite=True trains again", run_folder)
             else:
-                if checkpoint is not None:
-                    log.info("resuming in %s from step %d", run_folder, saved["global_step"])
-                # A missing compiler or device is refused before data are simulated.
-                parts |= dict(config=config, compile=compiles(compile, steps, trainer))
-                parts["clipping"] = {key: trainer[key] for key in CLIPPING if key in trainer}
-                if callbacks is None:
-                    callbacks = [RolloutFigures(every_n_validations=4)]
-                if loggers is None:
-                    loggers = [tensorboard(run_folder)]
-                length = epochs(steps, validations)
-                loop = build_trainer(run_folder, trainer, callbacks, loggers, length)
-                identity = _same_data(source, run_folder, saved)
-                if store_to is not None:
-                    store(source, store_to)
-                if isinstance(source, LogSource):
-                    write_whole(run_folder / "log_report.md", source.report)
-                L.seed_everything(seed, verbose=False)
-                windows = build_data(parts.pop("data"), source, seed, length[1])
-                learner = _learner(model, windows, loop.world_size, seed, ensemble, parts)
-                if start_from is not None:
-                    _start_from(start_from, learner, new=checkpoint is None)
-                _fit(loop, learner, windows, identity, checkpoint, run_folder)
+                job.run(checkpoint, saved)
     except KeyboardInterrupt:
         way = f"the same call resumes it from {run_folder}" + " without overwrite" * overwrite
         if temporary is not None:
@@ -275,6 +264,54 @@ def train(
     builder = (lambda statistics: copy.deepcopy(model)) if isinstance(model, Predictor) else model
     run = load_run(run_folder, "best", trust=None, model=builder)
     return replace(run, _made_in_python=source if made_in_python else None, _temporary=temporary)
+
+
+@dataclass(kw_only=True)
+class _Job:
+    """A training with its defaults filled in, see :func:`train`; ``parts`` are its builders."""
+
+    folder: Path
+    source: DataSource
+    model: ModelBuilder | Predictor
+    parts: dict[str, Any]
+    config: dict[str, Any]
+    seed: int
+    ensemble: int
+    steps: int
+    validations: int
+    compile: bool | Literal["auto"]
+    trainer: Mapping[str, Any]
+    callbacks: Sequence[L.Callback] | None
+    loggers: Sequence[Logger] | None
+    start_from: Run | None
+    keeps_data: bool
+
+    def run(self, checkpoint: Path | None, saved: Mapping[str, Any]) -> None:
+        """Train, from a checkpoint and its content if there is one."""
+        if checkpoint is not None:
+            log.info("resuming in %s from step %d", self.folder, saved["global_step"])
+        # A missing compiler or device is refused before data are simulated.
+        parts = self.parts | dict(
+            config=self.config,
+            compile=compiles(self.compile, self.steps, self.trainer),
+            clipping={key: self.trainer[key] for key in CLIPPING if key in self.trainer},
+        )
+        figures = [RolloutFigures(every_n_validations=4)]
+        callbacks = figures if self.callbacks is None else self.callbacks
+        loggers = [tensorboard(self.folder)] if self.loggers is None else self.loggers
+        length = epochs(self.steps, self.validations)
+        loop = build_trainer(self.folder, self.trainer, callbacks, loggers, length)
+        identity = _same_data(self.source, self.folder, saved)
+        if self.keeps_data:
+            store(self.source, self.folder / TRAJECTORIES)
+        if isinstance(self.source, LogSource):
+            write_whole(self.folder / "log_report.md", self.source.report)
+        L.seed_everything(self.seed, verbose=False)
+        windows = build_data(parts.pop("data"), self.source, self.seed, length[1])
+        learner = _learner(self.model, windows, loop.world_size, self.seed, self.ensemble, parts)
+        if self.start_from is not None:
+            _start_from(self.start_from, learner, new=checkpoint is None)
+        _fit(loop, learner, windows, identity, checkpoint, self.folder)
 
 
 def _by_name(kind: str, value: Any, names: Mapping[str, Any]) -> Any:
@@ -321,8 +358,12 @@ def _model_description(model: Any) -> dict[str, Any]:
     }
 
 
-def _description(source: DataSource) -> dict[str, Any]:
-    """Describe a source that was made in Python: its trajectories are stored in the run folder."""
+def _description(
+    source: DataSource, model: Any, name: str | None, parts: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Describe a training in Python; its trajectories are stored in the run folder."""
+    factory = model.func if isinstance(model, partial) else model
+    name = name or getattr(factory, "__name__", type(factory).__name__)
     stored = {
         "_target_": "pinn_dyn.data.StoredSource",
         "path": TRAJECTORIES,
@@ -332,12 +373,12 @@ def _description(source: DataSource) -> dict[str, Any]:
         "angles": list(source.angles),
         "delay": source.input_delay.tolist(),
     }
-    if not isinstance(source, LogSource):
-        return {"dataset": stored}
-    # Columns and cleaning, for predictions along a data frame.
-    columns = {name: described(getattr(source, name)) for name in _COLUMNS}
-    log_part = {"_target_": "pinn_dyn.data.LogSource", "files": "*", **columns}
-    return {"dataset": stored, "log": log_part}
+    config = {"name": f"{source.name}/{name}", "model_name": name, "dataset": stored}
+    if isinstance(source, LogSource):
+        # Columns and cleaning, for predictions along a data frame.
+        columns = {key: described(getattr(source, key)) for key in _COLUMNS}
+        config["log"] = {"_target_": "pinn_dyn.data.LogSource", "files": "*", **columns}
+    return config | _model_description(model) | {key: described(x) for key, x in parts.items()}
 
 
 def build_data(
@@ -356,21 +397,6 @@ def _statistics(windows: DynamicsData, devices: int) -> Statistics:
         if windows.batch_size % devices:
             raise ValueError(f"batch_size {windows.batch_size} is no multiple of {devices} devices")
         return windows.statistics
-
-
-def build_predictor(
-    model: ModelBuilder | Predictor, statistics: Statistics, seed: int, ensemble: int = 1
-) -> Predictor:
-    """Build the model, or an ensemble of models of the seeds seed, seed + 1, ..."""
-    if isinstance(model, Predictor):
-        return model
-    if ensemble == 1:
-        return model(statistics=statistics)
-    members = []
-    for k in range(ensemble):
-        L.seed_everything(seed + k, verbose=False)
-        members.append(model(statistics=statistics))
-    return Ensemble(members)
 
 
 def _check_windows(model: Predictor, windows: DynamicsData) -> None:

@@ -15,6 +15,10 @@ from pinn_dyn.mechanics import Trajectory
 
 DIVERGENCE_FACTOR = 1e3
 """A rollout has diverged once its error exceeds this multiple of the spread of the true q."""
+VALIDATION_ERROR = "val/error_mean"
+"""Metric that summarizes a training; sweeps minimize it."""
+BEST_BY = "val/error_windowed"
+"""Metric that chooses the best checkpoint. A long rollout may err least before it learns."""
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,12 @@ from pinn_dyn.training.soap import SOAP
 if TYPE_CHECKING:
     from pinn_dyn.training.checkpoints import WholeCheckpoints
     from pinn_dyn.training.learner import DynamicsLearner
-    from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
+    from pinn_dyn.training.least_squares_learner import COVARIANCE, FIT, LeastSquaresLearner
 
 __all__ = [
     "COVARIANCE",
     "ELEMENTWISE",
+    "FIT",
     "SOAP",
     "DynamicsLearner",
     "Fit",

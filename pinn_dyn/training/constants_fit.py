@@ -40,6 +40,7 @@ class Fit:
         errors: smallest validation errors of the stages, ``(V,)``, or NaN.
         stopped_in: stage in which the fit was interrupted, or None if it is finished.
         scores: covariance of the data's gradient, see :func:`block_scores`; None: the information.
+        identified: z after the inverse dynamics, if that was a stage of the fit, ``(P,)``.
     """
 
     covariance: Tensor
@@ -52,6 +53,7 @@ class Fit:
     errors: Tensor = UNKNOWN
     stopped_in: int | None = None
     scores: Tensor | None = None
+    identified: Tensor | None = None
 
     def state(self) -> dict[str, Any]:
         """Convert to tensors and numbers for a checkpoint."""

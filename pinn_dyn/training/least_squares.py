@@ -171,10 +171,13 @@ class LeastSquares:
         planned = len(stages) - len(growth)
         best, number = stopped, (stopped.stopped_in or 0) if stopped else 0
         lowest = best.errors if best else UNKNOWN
+        identified = best.identified if best else None
         texts = [f"{best.stage} {lowest.mean():.4g}"] if best and best.stage else []
         try:
             for stage, solve in list(stages.items())[number:]:
                 result = solve()
+                if stage == IDENTIFICATION:
+                    identified = result.z
                 errors = UNKNOWN if validate is None else validate(model)
                 texts.append(f"{stage} {errors.mean():.4g}")
                 worse = _clearly_larger(errors, lowest)
@@ -191,7 +194,8 @@ class LeastSquares:
             zero = torch.zeros_like(prior.root)
             covariance = posterior_covariance(zero, prior.root)
             partial_fit = best or Fit(covariance, zero, prior, float("nan"), 0)
-            raise StoppedFit(replace(partial_fit, stopped_in=number)) from interrupt
+            partial_fit = replace(partial_fit, stopped_in=number, identified=identified)
+            raise StoppedFit(partial_fit) from interrupt
         finally:
             model.to(precision)
         assert best is not None
@@ -199,7 +203,7 @@ class LeastSquares:
         vector_to_parameters(best.z.to(precision), model.parameters())
         if validate is not None and len(stages) > 1:
             log.info("least squares keeps %s: validation errors %s", best.stage, ", ".join(texts))
-        return replace(best, stopped_in=None)
+        return replace(best, stopped_in=None, identified=identified)
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
         z, names = parameters_to_vector(model.parameters()).detach(), model.parameter_names()

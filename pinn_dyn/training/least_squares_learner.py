@@ -23,8 +23,7 @@ from pinn_dyn.training.learner import DynamicsLearner, Validator
 from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.losses import WindowLoss
 
-COVARIANCE = "covariance"
-_FIT = "fit"
+COVARIANCE, FIT = "covariance", "fit"
 """Keys of the covariance of the constants, and of the fit, in a checkpoint."""
 
 
@@ -111,13 +110,13 @@ class LeastSquaresLearner(DynamicsLearner):
         """Save the fit, and its covariance for later fits."""
         if self.result is not None:
             checkpoint[COVARIANCE] = self.result.covariance
-            checkpoint[_FIT] = self.result.state()
+            checkpoint[FIT] = self.result.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Continue the fit of the checkpoint, if any."""
-        if _FIT in checkpoint:
+        if FIT in checkpoint:
             count = sum(p.numel() for p in self.model.parameters())
-            self.result = Fit.from_state(checkpoint[_FIT], count)
+            self.result = Fit.from_state(checkpoint[FIT], count)
 
     def configure_optimizers(self) -> Any:
         """Return an optimizer that does nothing; the trainer counts its steps."""

@@ -17,8 +17,8 @@ import torch
 from scipy.signal import savgol_filter
 
 import pinn_dyn
-from pinn_dyn.app.build import training_arguments
 from pinn_dyn.app.config import composed
+from pinn_dyn.app.train import training_arguments
 from pinn_dyn.app.training import STEPS
 from pinn_dyn.app.training import _windows as default_windows
 from pinn_dyn.data import DynamicsData
