@@ -16,6 +16,7 @@ from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import load
 from pinn_dyn.control import DataRegion, Plant, SystemPlant
 from pinn_dyn.data import DataSource
+from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.rollout import path_between
 
@@ -119,7 +120,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.dt = step or (data.statistics.step if isinstance(data, Run) else sample_time)
         if isinstance(robot, Run):
             delay, step_of_training = torch.from_numpy(robot.input_delay), robot.statistics.step
-            robot = ModelPlant(double_copy(robot.system), step=step_of_training, delay=delay)
+            robot = ModelPlant(model_for_rollouts(robot.system), step=step_of_training, delay=delay)
         elif isinstance(robot, MechanicalSystem):
             robot = SystemPlant(double_copy(robot))
         self.plant = robot

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -83,6 +83,7 @@ class Run:
     _made_in_python: DataSource | None = None
     _temporary: TemporaryDirectory[str] | None = None
     _may_simulate: bool = True
+    _rollouts: dict[str, Any] = field(default_factory=dict, init=False)
 
     def __repr__(self) -> str:
         name, data = self.config["model_name"], self.config["dataset"].get("name")
@@ -212,8 +213,8 @@ class Run:
 
         ``predict(start, u, t)`` simulates the model, and returns the states x(t_k), ``(*batch, T,
         2N)``. The input between its samples is interpolated as in the training data, and acts after
-        the ``delay`` of the data set; before the first sample it is constant. Long motions run as a
-        loop in C if there is a C compiler.
+        the ``delay`` of the data set; before the first sample it is constant. With a C compiler, a
+        loop in C is built once a model has taken 1,500 steps, and serves all later calls.
 
         ``predict(frame)`` returns q and v in the columns, units and index of a log, whose columns
         the frame needs. It is cleaned by the same steps. Every run starts from its first row.
@@ -232,10 +233,10 @@ class Run:
             if self.log is None:
                 raise ValueError("the training data have no columns of a log: give start, u and t")
             with torch.no_grad():
-                return predict_frame(model_for_rollouts(self.model), self.log, start)
+                return predict_frame(self._for_rollouts(), self.log, start)
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
-            return model_for_rollouts(self.model).predict(x0, times, signal).numpy()
+            return self._for_rollouts().predict(x0, times, signal).numpy()
 
     def predict_interval(
         self,
@@ -266,10 +267,17 @@ class Run:
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
             paths = model_for_rollouts(ensemble).member_increments(x0, times, signal)
-            mean = model_for_rollouts(self.model).predict(x0, times, signal)
+            mean = self._for_rollouts().predict(x0, times, signal)
         width = float(half_widths(len(paths), level)) * (1 + 1 / len(paths)) ** 0.5
         reach = factor * width * paths.std(dim=0)
         return (mean - reach).numpy(), (mean + reach).numpy()
+
+    def _for_rollouts(self) -> Predictor:
+        """Return the model with loops in C, copied once for the present weights."""
+        weights = [(x.data_ptr(), x._version) for x in self.model.state_dict().values()]
+        if self._rollouts.get("weights") != weights:
+            self._rollouts.update(weights=weights, model=model_for_rollouts(self.model))
+        return self._rollouts["model"]
 
     def _motion(
         self, start: Values, u: Values | None, t: Values | None

@@ -28,6 +28,8 @@ QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
 """Optimization that takes a third of the time of ``-O3`` for a rigid chain with sticking joints.
 The code has 0.7 to 0.8 of its speed (benchmarks/long_rollout.py)."""
 
+_MOST_PROGRAMS = 100  # in the cache folder
+
 
 def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[Tensor], Tensor]:
     """Return y = f(x) for the rows of float64 tensors, in C.
@@ -79,19 +81,11 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     compiler = find_compiler()
     if compiler is None:
         raise FileNotFoundError("no C compiler is installed: set CC to one")
-    flags = [*_FLAGS, *optimization]
+    flags, folder = [*_FLAGS, *optimization], _folder()
     digest = hashlib.sha256((code + _target(*compiler, *flags)).encode()).hexdigest()
-    folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser() / "compiled"
-    with suppress(OSError):  # a read-only folder: the library serves this process alone
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    is_safe = _is_safe(folder)
-    if is_safe:
-        for library in folder.glob(f"{digest}-*.so"):
-            if _is_safe(library) and library.name == f"{digest}-{_sha256(library)}.so":
-                return ctypes.CDLL(str(library))
-    elif folder.is_dir():
-        log.warning("%s is not used: others own or may write it, run chmod -R go-w there", folder)
-    is_cache = is_safe and os.access(folder, os.W_OK)
+    for library in _unchanged(digest, "so"):
+        return ctypes.CDLL(str(library))
+    is_cache = _is_safe(folder) and os.access(folder, os.W_OK)
     with TemporaryDirectory(dir=folder if is_cache else None) as name:
         source = Path(name) / "code.c"
         source.write_text(code)
@@ -101,6 +95,48 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
         if is_cache:
             os.replace(compiled, folder / f"{digest}-{_sha256(compiled)}.so")
     return loaded
+
+
+def remember(key: str, code: str, values: Tensor) -> None:
+    """Keep code and its numbers in the cache folder, for :func:`recall` in later processes."""
+    folder = _folder()
+    if not _is_safe(folder):
+        return
+    with suppress(OSError), TemporaryDirectory(dir=folder) as name:
+        path = Path(name) / "code.pt"
+        torch.save((code, values), path)
+        path.chmod(0o600)
+        earlier = [*folder.glob(f"{key}-*.pt")]
+        others = sorted(folder.glob("*.pt"), key=lambda x: x.stat().st_mtime)
+        os.replace(path, folder / f"{key}-{_sha256(path)}.pt")
+        for old in {*earlier, *others[:-_MOST_PROGRAMS]}:
+            old.unlink(missing_ok=True)
+
+
+def recall(key: str) -> tuple[str, Tensor] | None:
+    """Return the code and the numbers that :func:`remember` has kept, if any."""
+    for path in _unchanged(key, "pt"):
+        os.utime(path)  # the oldest files are deleted
+        code, values = torch.load(path, weights_only=True)
+        return code, values
+    return None
+
+
+def _folder() -> Path:
+    """Return the cache folder, which only this user may write."""
+    folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser() / "compiled"
+    with suppress(OSError):  # a read-only folder: a library serves this process alone
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if folder.is_dir() and not _is_safe(folder):
+        log.warning("%s is not used: others own or may write it, run chmod -R go-w there", folder)
+    return folder
+
+
+def _unchanged(key: str, ending: str) -> list[Path]:
+    """Return the file of a key in the cache folder, if its content has the SHA-256 in its name."""
+    folder = _folder()
+    paths = folder.glob(f"{key}-*.{ending}") if _is_safe(folder) else []
+    return [x for x in paths if _is_safe(x) and x.name == f"{key}-{_sha256(x)}.{ending}"]
 
 
 def _is_safe(path: Path) -> bool:

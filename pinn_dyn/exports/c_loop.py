@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import logging
 import pickle
+from collections import Counter
+from contextlib import suppress
 from io import BytesIO
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
 from pinn_dyn.exports.c_code import PRELUDE, CFunction, Constants
 from pinn_dyn.exports.c_file import find_compiler
-from pinn_dyn.exports.c_library import QUICK, load_code
+from pinn_dyn.exports.c_library import QUICK, load_code, recall, remember
 from pinn_dyn.exports.program import trace
 from pinn_dyn.mechanics.compilation import Wrapped
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator
@@ -21,10 +25,11 @@ from pinn_dyn.mechanics.signal import Signal
 
 log = logging.getLogger(__name__)
 
-STEPS = 3000
-"""Number of steps from which a loop pays off at its first use. A step in Python takes 4 to 10 ms.
-Building a loop takes up to 12 s, and 1 to 4 s from the cache folder (benchmarks/long_rollout.py).
-"""
+STEPS = 1500
+"""Number of steps in Python after which a loop is built. A step of a trajectory takes 4 to 15 ms,
+and building a loop up to 12 s (benchmarks/long_rollout.py)."""
+TRAJECTORIES = 100
+"""Number of trajectories with which a step in Python takes twice as long as with one."""
 NUMBERS = 2**21
 """Number of inputs that are computed at once, to limit the memory of large batches."""
 _LOOP = """
@@ -42,8 +47,9 @@ class CLoop(Wrapped):
     """Integrator that runs long paths as a loop in C, in float64 and without gradients.
 
     The states are those of the inner integrator up to rounding. The loop is compiled once for each
-    kind of model and kept in the cache folder. The inner integrator computes short paths, and all
-    paths where there is no C compiler or no C code for an operation of the model.
+    kind of model and kept in the cache folder, where later processes find it. Until a model has
+    taken :data:`STEPS` steps without a loop, the inner integrator computes its paths, and also
+    where there is no C compiler or no C code for an operation of the model.
 
     Args:
         inner: the method.
@@ -59,10 +65,10 @@ class CLoop(Wrapped):
             return self.inner.path(dynamics, start, grid, signal)
         leading, batch = start.shape[: self.members], start.shape[self.members : -1]
         x = start.reshape(*leading, -1, start.shape[-1]).movedim(self.members, 0).contiguous()
-        u = signal.u[..., 0, :].reshape(*leading, len(x), -1)[..., 0, :]
+        u = signal.u[..., 0, :].reshape(*leading, len(x), -1)[..., :1, :].movedim(-2, 0)
         u = u.expand(len(self.nodes), *u.shape).contiguous()
         fits = start.dtype == torch.float64 and start.is_cpu and not torch.is_grad_enabled()
-        loop = _loop_of(dynamics, self, x[0], u, grid) if fits else None
+        loop = _loop_of(dynamics, self, x, u, grid) if fits else None
         if loop is None:
             return self.inner.path(dynamics, start, grid, signal)
         blocks = [torch.zeros_like(x)[:, None]]
@@ -76,30 +82,15 @@ class CLoop(Wrapped):
 
 
 class _Loop:
-    """Compiled loop of a model over the steps of one trajectory after another."""
+    """Compiled loop of a model over the steps of one trajectory after another.
 
-    def __init__(self, dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor):
-        step = {"increment": torch.zeros_like(x), "start": x, "inputs": inputs, "h": h}
-        programs, derivative = {}, dynamics.state_derivative
-        if x.ndim == 1:
-            rate = {"x": x, "input": inputs[0]}
-            programs["state_derivative"] = trace(derivative, rate, ["rate"], lines=False)
-            dynamics.state_derivative = lambda *values: _rate(*(y.contiguous() for y in values))
-        try:
-            function = dynamics.integration_step
-            programs["integration_step"] = trace(function, step, ["end"], lines=False)
-        finally:
-            vars(dynamics).pop("state_derivative", None)
-        constants, code = _Values("double"), []
-        for name, program in programs.items():
-            parameters = ["values", *program.inputs, *program.outputs]
-            text = ", ".join("real h" if x == "h" else f"real *restrict {x}" for x in parameters)
-            lines = CFunction(program, constants).lines
-            code += [f"static void {name}({text})", "{", *lines, "}"]
-        definitions = ["typedef double real;", PRELUDE, *constants.definitions()]
-        loop = _LOOP.format(size=x.numel(), stages=inputs.numel())
-        self._function = load_code("\n".join([*definitions, *code, loop]), QUICK).roll_out
-        self._values = torch.cat([*constants.values, x.new_zeros(1)])
+    Args:
+        code: the code in C, which may be compiled already.
+        values: numbers of the model, the first argument of the code.
+    """
+
+    def __init__(self, code: str, values: Tensor):
+        self._function, self._values = load_code(code, QUICK).roll_out, values
 
     def __call__(self, increment: Tensor, start: Tensor, inputs: Tensor, lengths: Tensor) -> Tensor:
         """Return the increments after the steps, ``(B, T, ...)``, of B trajectories."""
@@ -109,6 +100,31 @@ class _Loop:
         values, *pointers = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
         self._function(values, ctypes.c_long(len(start)), ctypes.c_long(len(lengths)), *pointers)
         return path[:, 1:]
+
+
+def _traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> tuple[str, Tensor]:
+    """Return the code of the loop of a model, and the numbers of the model."""
+    step = {"increment": torch.zeros_like(x), "start": x, "inputs": inputs, "h": h}
+    programs, derivative = {}, dynamics.state_derivative
+    if x.ndim == 1:
+        rate = {"x": x, "input": inputs[0]}
+        programs["state_derivative"] = trace(derivative, rate, ["rate"], lines=False)
+        dynamics.state_derivative = lambda *values: _rate(*(y.contiguous() for y in values))
+    try:
+        function = dynamics.integration_step
+        programs["integration_step"] = trace(function, step, ["end"], lines=False)
+    finally:
+        vars(dynamics).pop("state_derivative", None)
+    constants, code = _Values("double"), []
+    for name, program in programs.items():
+        parameters = ["values", *program.inputs, *program.outputs]
+        text = ", ".join("real h" if x == "h" else f"real *restrict {x}" for x in parameters)
+        lines = CFunction(program, constants).lines
+        code += [f"static void {name}({text})", "{", *lines, "}"]
+    definitions = ["typedef double real;", PRELUDE, *constants.definitions()]
+    loop = _LOOP.format(size=x.numel(), stages=inputs.numel())
+    text = "\n".join([*definitions, *code, loop])
+    return text, torch.cat([*constants.values, x.new_zeros(1)])
 
 
 @torch.library.custom_op("pinn_dyn::state_derivative", mutates_args=())
@@ -133,46 +149,78 @@ class _Values(Constants):
 
 
 class _Content(pickle.Pickler):
-    """Pickler that writes a tensor as its type, shape and numbers."""
+    """Pickler that writes a tensor as its type, shape and numbers, and a set in order."""
 
     def persistent_id(self, value: Any) -> Any:
         if isinstance(value, Tensor):
             array = value.detach().numpy()
             return str(array.dtype), array.shape, array.tobytes()
-        return None
+        return sorted(map(str, value)) if isinstance(value, set) else None
 
 
-_LOOPS: dict[bytes, _Loop | None] = {}
+_LOOPS: dict[str, _Loop | None] = {}
 """Loops of this process by the content of their models; None for a model without a loop."""
+_WITHOUT: Counter[str] = Counter()
+"""Steps that were taken without a loop."""
+_KEYS: WeakKeyDictionary[CLoop, tuple[list[Any], str]] = WeakKeyDictionary()
 _MOST_LOOPS = 64
 
 
 def _loop_of(
     dynamics: Dynamics, integrator: CLoop, x: Tensor, u: Tensor, grid: Tensor
 ) -> _Loop | None:
-    """Return the loop of a model, or None where it does not pay off or is not possible."""
+    """Return the loop of a model, or None where it does not pay off yet or is not possible."""
     try:
-        content = BytesIO()
-        _Content(content).dump((dynamics, integrator))
-        key = content.getvalue()
-        if key not in _LOOPS:
-            if len(grid) <= STEPS or find_compiler() is None:
-                return None
-            if len(_LOOPS) >= _MOST_LOOPS:
-                _LOOPS.clear()
-            _LOOPS[key] = None
-            _LOOPS[key] = _compared(dynamics, x, u, grid[1] - grid[0])
-        return _LOOPS[key]
-    except Exception:  # from a head that cannot be traced, a compiler or a full disk
+        key = _key_of(dynamics, integrator)
+    except Exception:  # from a class of the user
         log.debug("no loop in C for %s", type(dynamics).__name__, exc_info=True)
         return None
+    if key not in _LOOPS:
+        steps = (len(grid) - 1) * (1 + len(x) // TRAJECTORIES)
+        is_new, _WITHOUT[key] = key not in _WITHOUT, _WITHOUT[key] + steps
+        known = recall(key) if is_new else None
+        if (known is None and _WITHOUT[key] < STEPS) or find_compiler() is None:
+            return None
+        if len(_LOOPS) >= _MOST_LOOPS:
+            _LOOPS.clear()
+        _LOOPS[key] = None
+        try:
+            _LOOPS[key] = _compared(key, known, dynamics, x[0], u[:, 0], grid[1] - grid[0])
+        except Exception:  # from a head that cannot be traced, a compiler or a full disk
+            log.debug("no loop in C for %s", type(dynamics).__name__, exc_info=True)
+    return _LOOPS[key]
 
 
-def _compared(dynamics: Dynamics, x: Tensor, u: Tensor, h: Tensor) -> _Loop:
-    """Return a loop whose first step is that of the model."""
-    loop = _Loop(dynamics, x, u, h)
+def _key_of(dynamics: Any, integrator: CLoop) -> str:
+    """Return a digest of all that a path depends on, anew where a tensor has changed."""
+    tensors = [*dynamics.parameters(), *dynamics.buffers()]
+    versions = [id(dynamics), *((x.data_ptr(), x._version) for x in tensors)]
+    known, key = _KEYS.get(integrator, (None, ""))
+    if known != versions:
+        content = BytesIO()
+        _Content(content).dump((dynamics, integrator))
+        key = hashlib.sha256(content.getvalue()).hexdigest()
+        _KEYS[integrator] = versions, key
+    return key
+
+
+def _compared(
+    key: str, known: tuple[str, Tensor] | None, dynamics: Any, x: Tensor, u: Tensor, h: Tensor
+) -> _Loop:
+    """Return a loop whose first step is that of the model, by code that is known already or new."""
     zero = torch.zeros_like(x)
-    step = loop(zero[None], x[None], u[None, None], h[None])[0, 0]
     expected = dynamics.integration_step(zero, x, u, h)
-    torch.testing.assert_close(step, expected, rtol=1e-9, atol=1e-12, equal_nan=True)
+
+    def loop_by(code: str, values: Tensor) -> _Loop:
+        loop = _Loop(code, values)
+        step = loop(zero[None], x[None], u[None, None], h[None])[0, 0]
+        torch.testing.assert_close(step, expected, rtol=1e-9, atol=1e-12, equal_nan=True)
+        return loop
+
+    if known is not None:
+        with suppress(AssertionError):  # a class has changed since
+            return loop_by(*known)
+    new = _traced(dynamics, x, u, h)
+    loop = loop_by(*new)
+    remember(key, *new)
     return loop

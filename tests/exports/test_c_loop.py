@@ -1,6 +1,7 @@
 """Rollouts as loops in C, beside the loop in Python."""
 
 import logging
+from collections import Counter
 from functools import partial
 
 import pytest
@@ -25,6 +26,7 @@ def cached(monkeypatch, tmp_path):
     monkeypatch.setattr(c_loop, "STEPS", 1)
     monkeypatch.setattr(c_loop, "QUICK", ("-O1",))
     monkeypatch.setattr(c_loop, "_LOOPS", {})
+    monkeypatch.setattr(c_loop, "_WITHOUT", Counter())
     return tmp_path
 
 
@@ -100,20 +102,50 @@ def test_models_of_one_kind_share_the_compiled_code_but_not_its_numbers(cached):
     assert (found - before).abs().max() > 1e-4
     assert len(c_loop._LOOPS) == 2
     assert len([*cached.glob("compiled/*.so")]) == 1
-    assert len([*cached.glob("compiled/*")]) == 1
+    assert len([*cached.glob("compiled/*")]) == 3  # and the numbers of both
+
+
+def next_process(monkeypatch, count=80):
+    """Roll out in a process that has no loops yet; return its only one."""
+    c_loop._LOOPS.clear()
+    c_loop._WITHOUT.clear()
+    found, expected = rolled_out(MODELS["momentum"](), count=count)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+    return next(iter(c_loop._LOOPS.values()), None)
 
 
 def test_a_compiled_loop_serves_the_next_process(monkeypatch, cached):
+    """It serves short paths, too, and is neither traced nor compiled again."""
     rolled_out(MODELS["momentum"]())
-    c_loop._LOOPS.clear()
     monkeypatch.setattr(c_library, "compile_c", None)
-    rolled_out(MODELS["momentum"]())
-    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop._Loop]
+    monkeypatch.setattr(c_loop, "STEPS", 10**6)
+    with monkeypatch.context() as patch:
+        patch.setattr(c_loop, "trace", None)
+        assert isinstance(next_process(monkeypatch, count=2), c_loop._Loop)
+    (known,) = cached.glob("compiled/*.pt")
+    known.write_bytes(known.read_bytes()[:-1])  # cut short: not read
+    assert next_process(monkeypatch) is None
+    monkeypatch.setattr(c_loop, "STEPS", 1)
+    assert isinstance(next_process(monkeypatch), c_loop._Loop)
     c_library._target.cache_clear()  # as for another processor
     monkeypatch.setattr(c_library, "_FLAGS", [*c_library._FLAGS, "-mtune=generic"])
-    c_loop._LOOPS.clear()
+    assert next_process(monkeypatch) is None
+
+
+def test_code_of_an_earlier_class_is_replaced(monkeypatch, cached):
     rolled_out(MODELS["momentum"]())
-    assert [*c_loop._LOOPS.values()] == [None]
+    code = c_loop._LOOP.replace("lengths[k]", "2 * lengths[k]")
+    with monkeypatch.context() as patch:
+        patch.setattr(c_loop, "_LOOP", code)
+        patch.setattr(torch.testing, "assert_close", lambda *_, **__: None)
+        c_loop._LOOPS.clear()
+        c_loop._WITHOUT.clear()
+        for path in cached.glob("compiled/*.pt"):
+            path.unlink()
+        rolled_out(MODELS["momentum"]())  # writes the numbers with wrong code
+    assert isinstance(next_process(monkeypatch), c_loop._Loop)
+    (known,) = cached.glob("compiled/*.pt")
+    assert "2 * lengths" not in torch.load(known, weights_only=True)[0]
 
 
 class Bessel(LinearSystem):
@@ -150,9 +182,9 @@ def test_without_a_loop_the_states_are_those_of_the_model(monkeypatch, cached, c
 def test_short_paths_and_gradients_do_not_build_a_loop(monkeypatch):
     monkeypatch.setattr(c_loop, "STEPS", 100)
     model = make_structured("lnn", **NETWORK)
-    rolled_out(model)
+    rolled_out(model, count=60)
     assert not c_loop._LOOPS
-    rolled_out(model, count=102)
+    rolled_out(model, count=60)  # together long enough
     assert len(c_loop._LOOPS) == 1
     copy = model_for_rollouts(model)
     x0 = torch.full((6,), 0.1).double().requires_grad_()
