@@ -8,6 +8,8 @@ import pkgutil
 from collections.abc import Callable
 from typing import Any
 
+import torch
+
 from pinn_dyn.app.config import ConfigError, build_part, composed
 from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource
@@ -47,15 +49,13 @@ def build_predictor(
     model: ModelBuilder | Predictor, statistics: Statistics, seed: int, ensemble: int = 1
 ) -> Predictor:
     """Build the model, or an ensemble of models of the seeds seed, seed + 1, ..."""
-    from lightning import seed_everything  # takes seconds to import
-
     if isinstance(model, Predictor):
         return model
     if ensemble == 1:
         return model(statistics=statistics)
     members = []
     for k in range(ensemble):
-        seed_everything(seed + k, verbose=False)
+        torch.manual_seed(seed + k)
         members.append(model(statistics=statistics))
     return Ensemble(members)
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from filelock import FileLock, Timeout
-from lightning.pytorch.utilities.seed import isolate_rng
 
 from pinn_dyn import __version__
 from pinn_dyn.app.build import ModelBuilder, build_predictor, model_builder
@@ -22,14 +21,14 @@ from pinn_dyn.app.config import ConfigError, write_config
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.trust import is_trusted, packages, require_trusted
 from pinn_dyn.data import data_changes
-from pinn_dyn.data.whole import write_whole
+from pinn_dyn.data.whole import save_whole, write_whole
 from pinn_dyn.evaluation.tables import short
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import set_output_limits
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
-from pinn_dyn.training import COVARIANCE, FIT, WholeCheckpoints
+from pinn_dyn.training import COVARIANCE, FIT
 
 METRICS, CHECKPOINTS = "metrics.json", "checkpoints"
 RECORD, DATA, FINISHED = "record", "data", "finished"
@@ -82,7 +81,7 @@ def load_run(
         log.warning("%s: the training has not ended", path)
     try:
         statistics = Statistics.from_dict(saved["hyper_parameters"]["statistics"])
-        with isolate_rng():  # models draw their initial weights
+        with torch.random.fork_rng(devices=[]):  # models draw their initial weights
             predictor = build_predictor(
                 model or model_builder(config), statistics, config["seed"], config["ensemble"]
             )
@@ -182,7 +181,7 @@ def finish(folder: Path, record: dict[str, Any]) -> None:
     for name in ("best", "last"):
         path = folder / CHECKPOINTS / f"{name}.ckpt"
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        WholeCheckpoints().save_checkpoint({**saved, RECORD: record, FINISHED: True}, path)
+        save_whole(path, {**saved, RECORD: record, FINISHED: True})
     write_whole(folder / METRICS, json.dumps(record, indent=2))
 
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import torch
 
 _LARGEST = 2**26
 """Largest size of a text file of a run folder, bytes."""
@@ -41,3 +45,13 @@ def write_whole(path: Path, text: str) -> None:
     """Write a text in UTF-8 with :func:`whole`."""
     with whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def save_whole(path: Path, content: Any) -> None:
+    """Save tensors and plain values with :func:`whole`."""
+    buffer = io.BytesIO()  # torch.save itself says nothing of a full disk
+    torch.save(content, buffer)
+    with whole(path) as partial, partial.open("wb") as file:
+        file.write(buffer.getbuffer())
+        file.flush()
+        os.fsync(file.fileno())

@@ -2,28 +2,33 @@
 
 from typing import TYPE_CHECKING
 
-from pinn_dyn.evaluation.animation import animate
 from pinn_dyn.evaluation.baselines import build_baselines
 from pinn_dyn.evaluation.calibration import Calibration, calibration
-from pinn_dyn.evaluation.closed_loops import ControlResult, close_loop, close_loops
-from pinn_dyn.evaluation.control_figures import (
-    closed_loop_figure,
-    controller_comparison_figure,
-    steady_state_figure,
-    tip_path_figure,
-)
 from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_metrics
-from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
-from pinn_dyn.evaluation.figures import error_figure, sweep_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
-from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.metrics import RolloutMetrics, rollout_metrics
-from pinn_dyn.evaluation.plots import save
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
 from pinn_dyn.evaluation.torque import TorqueError, torque_error
 from pinn_dyn.lazy import lazy_attributes
 
 if TYPE_CHECKING:
+    from pinn_dyn.evaluation.animation import animate
+    from pinn_dyn.evaluation.closed_loops import ControlResult, close_loop, close_loops
+    from pinn_dyn.evaluation.control_figures import (
+        closed_loop_figure,
+        controller_comparison_figure,
+        steady_state_figure,
+        tip_path_figure,
+    )
+    from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
+    from pinn_dyn.evaluation.figures import (
+        error_figure,
+        sweep_figure,
+        terms_figure,
+        trajectory_figure,
+    )
+    from pinn_dyn.evaluation.log_figures import cleaning_figure
+    from pinn_dyn.evaluation.plots import save
     from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
 
 __all__ = [

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import os
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.whole import save_whole
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -22,9 +19,4 @@ class WholeCheckpoints(TorchCheckpointIO):
         """Write a checkpoint, and replace an existing one."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        content = io.BytesIO()  # torch.save itself says nothing of a full disk
-        torch.save(checkpoint, content)
-        with whole(path) as partial, partial.open("wb") as file:
-            file.write(content.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
+        save_whole(path, checkpoint)

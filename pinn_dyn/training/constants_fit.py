@@ -14,6 +14,8 @@ _UNEXPLAINED = 0.9
 """Share of the inputs from which the fit of the median joint explains nothing."""
 _LARGEST_SHARE = 0.9
 """Largest corrected share of a block of residuals in the information on a direction."""
+COVARIANCE, FIT = "covariance", "fit"
+"""Keys of the covariance of the constants, and of the fit, in a checkpoint."""
 UNKNOWN = torch.tensor(math.nan)
 """Validation error without validation."""
 

@@ -18,13 +18,10 @@ from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Predictor, Trajectory
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.constants_fit import Fit, StoppedFit
+from pinn_dyn.training.constants_fit import COVARIANCE, FIT, Fit, StoppedFit
 from pinn_dyn.training.learner import DynamicsLearner, Validator
 from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.losses import WindowLoss
-
-COVARIANCE, FIT = "covariance", "fit"
-"""Keys of the covariance of the constants, and of the fit, in a checkpoint."""
 
 
 class LeastSquaresLearner(DynamicsLearner):
