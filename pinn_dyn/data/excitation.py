@@ -22,11 +22,11 @@ Bounds = Annotated[
 ]
 """A range [low, high] with 0 < low <= high."""
 
-Signal = Callable[[np.ndarray], np.ndarray]
+InputSignal = Callable[[np.ndarray], np.ndarray]
 """Maps times ``(T,)`` in s to inputs ``(count, T, M)``: ``count`` signals drawn together."""
 
 
-def joined(signals: Sequence[Signal], which: np.ndarray, row: np.ndarray) -> Signal:
+def joined(signals: Sequence[InputSignal], which: np.ndarray, row: np.ndarray) -> InputSignal:
     """Join signals of several draws: signal k is number ``row[k]`` of ``signals[which[k]]``."""
 
     def signal(t: np.ndarray) -> np.ndarray:
@@ -44,7 +44,7 @@ class Excitation(abc.ABC):
     """
 
     @abc.abstractmethod
-    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> InputSignal:
         """Draw ``count`` signals for times from 0 to ``duration`` s."""
 
 
@@ -75,7 +75,7 @@ class MultiSine(_Bounded):
     frequency: Bounds = (0.1, 1.0)
     harmonics: PositiveInt = 4
 
-    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> InputSignal:
         """Draw ``count`` multi-sines; they do not depend on the duration."""
         peak = self._peaks(count, rng)
         shape = (*peak.shape, self.harmonics)
@@ -103,7 +103,7 @@ class Chirp(_Bounded):
 
     frequency: Bounds = (0.1, 2.0)
 
-    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> InputSignal:
         """Draw ``count`` chirps that sweep the whole band within ``duration`` s."""
         peak = self._peaks(count, rng)
         phase = rng.uniform(0, 2 * np.pi, peak.shape)
@@ -138,7 +138,7 @@ class Steps(_Bounded):
                 f"Steps: rise_time is {self.rise_time} s, expected at most hold[0] = {self.hold[0]}"
             )
 
-    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> InputSignal:
         """Draw ``count`` sequences of levels that cover ``duration`` s."""
         peak = self._peaks(count, rng)
         shape = (*peak.shape, int(np.ceil(duration / self.hold[0])) + 1)
@@ -164,7 +164,7 @@ class Mixture(Excitation):
 
     parts: Annotated[Sequence[Excitation], Field(min_length=1)]
 
-    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> InputSignal:
         """Draw ``count`` signals, shared out among the parts in turn."""
         kinds, index = len(self.parts), np.arange(count)
         signals = [

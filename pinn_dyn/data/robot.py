@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import torch
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveInt
+from torch import Tensor
 
-from pinn_dyn.data.cache import Arrays, load_or_make
+from pinn_dyn.data.cache import Arrays
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import Plan, RobotExcitation
-from pinn_dyn.data.simulation import SimulationError, momentum
-from pinn_dyn.data.source import SPLITS, DataSource, Splits
-from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.data.simulated import RecordedSource, split_recordings
+from pinn_dyn.data.source import SPLITS
 from pinn_dyn.progress import Progress
 from pinn_dyn.systems import SimulatedArm
 
@@ -27,7 +25,7 @@ _DRAWS = 20
 
 
 @dataclass(kw_only=True, eq=False)
-class RobotSource(DataSource):
+class RobotSource(RecordedSource):
     """Trajectories of a robot under motor torques, recorded once and cached on disk.
 
     Samples are q, v and the motor torque u, clipped to the robot's limits and without the joints'
@@ -56,16 +54,9 @@ class RobotSource(DataSource):
         ValueError: on a joint without limits.
     """
 
-    name: str
     system: SimulatedArm
     excitations: Annotated[Sequence[RobotExcitation], Field(min_length=1)]
-    duration: PositiveFloat
-    step: PositiveFloat
     train: PositiveInt
-    validation: PositiveInt
-    test: PositiveInt
-    seed: NonNegativeInt = 0
-    cache: str
     configurations: Mapping[str, Sequence[float]] | None = None  # type: ignore[assignment]
     may_simulate: bool = field(default=True, init=False)
 
@@ -84,29 +75,23 @@ class RobotSource(DataSource):
         self.labels = [f"q{i + 1} [rad]" for i in range(arm.num_coordinates)]
         self.input_labels = [f"τ{i + 1} [Nm]" for i in range(arm.num_coordinates)]
 
-    def load(self) -> Splits:
-        folder = Path(self.cache).expanduser()
-        arrays = load_or_make(folder, self.name, self.describe(), self.simulate)
-        t = torch.from_numpy(arrays["t"][:-1])
-        splits: dict[str, list[Trajectory]] = {}
-        for split in SPLITS:
-            motions = zip(*(torch.from_numpy(arrays[f"{split}_{x}"]) for x in "qvu"), strict=True)
-            p = partial(momentum, self.system)
-            splits[split] = [
-                Trajectory(q[:-1], (v[:-1] + v[1:]) / 2, Signal(t, u[:-1]), momentum=p)
-                for q, v, u in motions
-            ]
-        return Splits(**splits)
+    def _samples(
+        self, t: Tensor, q: Tensor, v: Tensor, u: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return t[:-1], q[:, :-1], (v[:, :-1] + v[:, 1:]) / 2, u[:, :-1]
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that the trajectories depend on: the key of the cache."""
-        keys = ("excitations", "duration", "step", "seed")
+        keys = ("excitations", "duration", "step", "seed", "counts")
         settings = {key: describe(getattr(self, key)) for key in keys}
-        counts = {split: getattr(self, split) for split in SPLITS}
-        return {"version": _VERSION, "robot": describe(self.system), "counts": counts, **settings}
+        return {"version": _VERSION, "robot": describe(self.system), **settings}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of trajectories of each split."""
+        return {split: getattr(self, split) for split in SPLITS}
 
     def simulate(self) -> Arrays:
-        """Record all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T + 1, .)``.
+        """Record all motions anew, with a sample more than a trajectory has.
 
         Raises:
             SimulationError: if no draw of a trajectory stays within the limits.
@@ -120,31 +105,26 @@ class RobotSource(DataSource):
                 f"started for a run folder: if you trust its author, add trust={system}"
             )
         t = np.arange(round(self.duration / self.step) + 2) * self.step
-        tasks = [
-            (index, k) for index, name in enumerate(SPLITS) for k in range(getattr(self, name))
-        ]
+        tasks = [(i, k) for i, count in enumerate(self.counts.values()) for k in range(count)]
         # One generator per trajectory: more trajectories do not change the others.
         rngs = [np.random.default_rng([self.seed, *task]) for task in tasks]
-        q, v, u = np.empty((3, len(tasks), len(t), self.system.num_coordinates))
+        kinds = np.array([k for _, k in tasks]) % len(self.excitations)
+        motions = np.full((3, len(tasks), len(t), self.system.num_coordinates), np.nan)
+
+        def record(excitation: RobotExcitation, rows: np.ndarray) -> np.ndarray:
+            return self._record(excitation.draw(self.system, t, [rngs[i] for i in rows]), t)
+
         for kind, excitation in enumerate(self.excitations):
-            rows = [i for i, task in enumerate(tasks) if task[1] % len(self.excitations) == kind]
-            for _ in range(_DRAWS):
-                if rows:
-                    plan = excitation.draw(self.system, t, [rngs[i] for i in rows])
-                    q[rows], v[rows], u[rows] = self._record(plan, t)
-                    rows = [i for i in rows if not self._inside(q[i], v[i]).all()]
-            if rows:
-                joints = np.array(self.system.joint_names)[~self._inside(q[rows], v[rows])]
-                raise SimulationError(
-                    f"{len(rows)} motions of {type(excitation).__name__} leave the position or "
-                    f"velocity limits of {', '.join(joints)} in each of {_DRAWS} draws: lower its "
-                    "reach, speed or amplitude"
-                )
-        arrays = {"t": t}
-        for index, name in enumerate(SPLITS):
-            rows = [i for i, task in enumerate(tasks) if task[0] == index]
-            arrays |= {f"{name}_q": q[rows], f"{name}_v": v[rows], f"{name}_u": u[rows]}
-        return arrays
+            self._draw_within_limits(
+                motions,
+                np.flatnonzero(kinds == kind),
+                partial(record, excitation),
+                self._inside,
+                draws=_DRAWS,
+                message=f"motions of {type(excitation).__name__} leave the position or velocity "
+                "limits of {} in each of {} draws: lower its reach, speed or amplitude",
+            )
+        return split_recordings(t, motions, self.counts)
 
     def _record(self, plan: Plan, t: np.ndarray) -> np.ndarray:
         """Record q, v and u of K motions that advance step by step together, ``(3, K, T, N)``."""
@@ -164,4 +144,4 @@ class RobotSource(DataSource):
     def _inside(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         arm = self.system
         inside = (q >= arm.q_low) & (q <= arm.q_high) & (np.abs(v) <= arm.v_max)
-        return np.asarray(inside.reshape(-1, inside.shape[-1]).all(0))
+        return np.asarray(inside.all(1))

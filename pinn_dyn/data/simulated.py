@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import abc
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays, load_or_make
-from pinn_dyn.data.excitation import Excitation, joined
-from pinn_dyn.data.excitation import Signal as InputSignal
+from pinn_dyn.data.excitation import Excitation, InputSignal, joined
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.simulation import SimulationError, momentum, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
@@ -23,9 +24,111 @@ from pinn_dyn.systems import HasDomain
 
 # Part of the cache key: raise it when the same settings give different numbers.
 _VERSION = 3
-# Within limits: largest number of draws of a motion, and draws that are simulated at once.
-_DRAWS = 40
+# Within limits: largest number of further draws of a motion, and draws simulated at once.
+_REDRAWS = 39
 _AT_ONCE = 3
+
+Motions = Sequence[np.ndarray] | np.ndarray
+"""q, v and u of K motions, ``(K, T, .)`` each."""
+
+
+@dataclass(kw_only=True, eq=False)
+class RecordedSource(DataSource):
+    """Trajectories of a simulated system, recorded once and cached on disk.
+
+    Args:
+        name: short name of the data set.
+        system: the truth.
+        duration: length of each training trajectory, s.
+        step: sample time of the simulation, s.
+        validation, test: number of trajectories.
+        seed: seed of all motions.
+        cache: folder of the cache; ``~`` is the home folder.
+    """
+
+    name: str
+    system: MechanicalSystem
+    duration: PositiveFloat
+    step: PositiveFloat
+    validation: PositiveInt
+    test: PositiveInt
+    seed: NonNegativeInt = 0
+    cache: str = "~/.cache/pinn_dyn"
+
+    @abc.abstractmethod
+    def describe(self) -> dict[str, object]:
+        """Return the settings that the recordings depend on: the key of the cache."""
+
+    @abc.abstractmethod
+    def simulate(self) -> Arrays:
+        """Record all motions anew: arrays ``t`` and ``<split>_<q, v, u>``, each ``(K, T, .)``."""
+
+    @abc.abstractmethod
+    def _samples(
+        self, t: Tensor, q: Tensor, v: Tensor, u: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the samples t, q, v and u of recorded motions."""
+
+    def load(self) -> Splits:
+        folder = Path(self.cache).expanduser()
+        arrays = load_or_make(folder, self.name, self.describe(), self.simulate)
+        splits: dict[str, list[Trajectory]] = {}
+        for split in SPLITS:
+            keys = ("t", f"{split}_q", f"{split}_v", f"{split}_u")
+            t, *motions = self._samples(*(torch.from_numpy(arrays[key]) for key in keys))
+            splits[split] = [
+                Trajectory(q, v, Signal(t, u), momentum=partial(momentum, self.system))
+                for q, v, u in zip(*motions, strict=True)
+            ]
+        return Splits(**splits)
+
+    def _draw_within_limits(
+        self,
+        motions: Motions,
+        rows: np.ndarray,
+        record: Callable[[np.ndarray], Motions],
+        inside: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        *,
+        draws: int,
+        message: str,
+    ) -> None:
+        """Replace motions that leave the limits by new draws that stay within them.
+
+        Args:
+            motions: all motions, changed in place.
+            rows: numbers of the motions to look at.
+            record: function from numbers of motions to one or more draws of each, draw after draw.
+            inside: function from q and v ``(K, T, N)`` to a mask ``(K, N)`` of coordinates that
+                stay within their limits.
+            draws: largest number of draws of a motion.
+            message: description with places for the names of coordinates and the number of draws.
+        """
+        q, v, _ = motions
+        left, drawn = rows[~inside(q[rows], v[rows]).all(-1)], 0
+        while left.size and drawn < draws:
+            new = record(left)
+            stays = inside(*new[:2]).all(-1).reshape(-1, left.size)
+            drawn += len(stays)
+            replaced = stays.any(0)
+            first = (stays.argmax(0) * left.size + np.arange(left.size))[replaced]
+            for old, values in zip(motions, new, strict=True):
+                old[left[replaced]] = values[first]
+            left = left[~replaced]
+        if left.size:
+            names = np.array(getattr(self.system, "joint_names", self.labels))
+            # Samples after a motion has left the limits are NaN.
+            recorded = (np.where(np.isnan(x), x[:, :1], x) for x in new[:2])
+            limited = message.format(", ".join(names[~inside(*recorded).all(0)]), drawn)
+            raise SimulationError(f"{self.name}: {left.size} {limited}")
+
+
+def split_recordings(t: np.ndarray, motions: Motions, counts: Mapping[str, int]) -> Arrays:
+    """Return the arrays ``t`` and ``<split>_<q, v, u>`` of motions that lie split after split."""
+    arrays, ends = {"t": t}, np.cumsum([*counts.values()])[:-1]
+    for key, values in zip("qvu", motions, strict=True):
+        for split, part in zip(counts, np.split(values, ends), strict=True):
+            arrays[f"{split}_{key}"] = part
+    return arrays
 
 
 @dataclass(frozen=True)
@@ -52,16 +155,8 @@ class InitialStates:
         return rng.uniform(self.q_low, self.q_high, shape), rng.uniform(-v_max, v_max, shape)
 
 
-class _Draw(NamedTuple):
-    """Initial states ``(K, N)`` and inputs of K motions."""
-
-    q0: np.ndarray
-    v0: np.ndarray
-    signal: InputSignal
-
-
 @dataclass(kw_only=True, eq=False)
-class SimulatedSource(DataSource):
+class SimulatedSource(RecordedSource):
     """Trajectories of a known system, simulated once and cached on disk.
 
     Validation and test trajectories have initial states and inputs that no training trajectory
@@ -96,13 +191,9 @@ class SimulatedSource(DataSource):
         ValueError: on settings that do not match, or ranges of q beyond the system's domain.
     """
 
-    name: str
-    system: MechanicalSystem
     excitation: Excitation
     initial_states: InitialStates
-    duration: PositiveFloat
     test_duration: PositiveFloat | None = None
-    step: PositiveFloat
     dead_time: NonNegativeFloat = 0.0
     delay: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.0
     keep_every: PositiveInt = 1
@@ -110,13 +201,9 @@ class SimulatedSource(DataSource):
     train_inputs: PositiveInt
     pairing: Literal["product", "matched"] = "product"
     q_limits: Sequence[Sequence[float]] | None = None
-    validation: PositiveInt
-    test: PositiveInt
-    seed: NonNegativeInt = 0
     rtol: PositiveFloat = 1e-8
     atol: PositiveFloat = 1e-9
     compile: bool = False
-    cache: str = "~/.cache/pinn_dyn"
     labels: Sequence[str]  # type: ignore[assignment]
     input_labels: Sequence[str]  # type: ignore[assignment]
     configurations: Mapping[str, Sequence[float]] = field(default_factory=dict)
@@ -149,21 +236,13 @@ class SimulatedSource(DataSource):
         self.angles = tuple(getattr(self.system, "angles", ()))
         self.labels, self.input_labels = list(self.labels), list(self.input_labels)
 
-    def load(self) -> Splits:
-        folder = Path(self.cache).expanduser()
-        arrays = load_or_make(folder, self.name, self.describe(), self.simulate)
-        t = torch.from_numpy(arrays["t"][:: self.keep_every])
-        splits: dict[str, list[Trajectory]] = {}
-        for split in SPLITS:
-            arrays_of_split = (arrays[f"{split}_{key}"][:, :: self.keep_every] for key in "qvu")
-            q, v, u = map(torch.from_numpy, arrays_of_split)
-            recorded = Signal(t[: u.shape[1]], u)
-            acting = recorded.delayed(torch.from_numpy(self.input_delay)).at(recorded.t)
-            splits[split] = [
-                Trajectory(q, v, Signal(recorded.t, u), momentum=partial(momentum, self.system))
-                for q, v, u in zip(q, v, acting.movedim(0, 1).contiguous(), strict=True)
-            ]
-        return Splits(**splits)
+    def _samples(
+        self, t: Tensor, q: Tensor, v: Tensor, u: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        q, v, u = (x[:, :: self.keep_every] for x in (q, v, u))
+        t = t[:: self.keep_every][: u.shape[1]].contiguous()
+        acting = Signal(t, u).delayed(torch.from_numpy(self.input_delay)).at(t)
+        return t, q, v, acting.movedim(0, 1).contiguous()
 
     @property
     def counts(self) -> dict[str, tuple[int, int]]:
@@ -172,14 +251,12 @@ class SimulatedSource(DataSource):
         return {"train": train, **{key: (getattr(self, key),) * 2 for key in SPLITS[1:]}}
 
     def describe(self) -> dict[str, object]:
-        """Return the settings that the simulation depends on: the key of the cache."""
         keys = "system excitation initial_states duration test_duration step counts pairing seed"
         keys += " rtol atol" if self.q_limits is None else " rtol atol q_limits"
         keys += " dead_time" if self.dead_time else ""
         return {"version": _VERSION} | {k: describe(getattr(self, k)) for k in keys.split()}
 
     def simulate(self) -> Arrays:
-        """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
         if self.test_duration in (None, self.duration):
             return self._simulate(SPLITS, self.duration, 0)
         # Two batches of one size: the compiled equation of motion serves both.
@@ -192,21 +269,24 @@ class SimulatedSource(DataSource):
         t = np.arange(round(duration / self.step) + 1) * self.step
         # One generator per split: more test trajectories do not change the training set.
         rngs = {s: np.random.default_rng([self.seed, SPLITS.index(s)]) for s in splits}
-        draw = self._draw(rngs)
-        count = len(draw.q0)
-        rows = np.arange(max(count, size)) % count
-        motions = [x[:count] for x in self._move([draw], rows, t)]
+        counts = {split: len(self._pairs(split)) for split in splits}
+        rows = np.arange(sum(counts.values()))
+        record = partial(self._record, rngs, t)
+        motions = [x[: len(rows)] for x in record(np.resize(rows, max(len(rows), size)), draws=1)]
         if self.q_limits is not None:
-            self._replace(motions, rngs, t)
+            low, high = np.array(self.q_limits, dtype=float)
+            self._draw_within_limits(
+                motions,
+                rows,
+                partial(record, draws=_AT_ONCE),
+                lambda q, v: ((q >= low) & (q <= high)).all(1),
+                draws=_REDRAWS,
+                message=f"of {len(rows)} motions leave q_limits of {{}} in each of {{}} draws",
+            )
         elif isinstance(self.system, HasDomain):
             for q in motions[0]:
                 self.system.check_domain(q.min(0), q.max(0))
-        arrays = {"t": t}
-        ends = np.cumsum([len(self._pairs(split)) for split in splits])[:-1]
-        for key, values in zip("qvu", motions, strict=True):
-            parts = zip(splits, np.split(values, ends), strict=True)
-            arrays |= {f"{split}_{key}": part for split, part in parts}
-        return arrays
+        return split_recordings(t, motions, counts)
 
     def _pairs(self, split: str) -> np.ndarray:
         """Return the numbers of the initial state and the input of each motion, ``(K, 2)``."""
@@ -215,7 +295,10 @@ class SimulatedSource(DataSource):
             return np.indices((states, inputs)).reshape(2, -1).T
         return np.tile(np.arange(states)[:, None], 2)
 
-    def _draw(self, rngs: Mapping[str, np.random.Generator]) -> _Draw:
+    def _draw(
+        self, rngs: Mapping[str, np.random.Generator]
+    ) -> tuple[np.ndarray, np.ndarray, InputSignal]:
+        """Draw initial states ``(K, N)`` and inputs of the motions of some splits."""
         starts, signals, rows = [], [], []
         for index, (split, rng) in enumerate(rngs.items()):
             states, inputs = self.counts[split]
@@ -224,55 +307,25 @@ class SimulatedSource(DataSource):
             signals.append(self.excitation.draw(inputs, self.duration, rng))
             rows += [(index, number) for number in pairs[:, 1]]
         q0, v0 = np.concatenate(starts, axis=1)
-        return _Draw(q0, v0, joined(signals, *np.array(rows).T))
+        return q0, v0, joined(signals, *np.array(rows).T)
 
-    def _move(
-        self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray
+    def _record(
+        self, rngs: Mapping[str, np.random.Generator], t: np.ndarray, rows: np.ndarray, draws: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        q0, v0, signals = zip(*draws, strict=True)
-        size = len(q0[0])
-        signal = joined(signals, rows // size, rows % size)
-
-        def acting(times: np.ndarray) -> np.ndarray:
-            return signal(times - self.dead_time)
-
+        """Simulate some draws of the motions of given numbers, draw after draw."""
+        q0, v0, signals = zip(*(self._draw(rngs) for _ in range(draws)), strict=True)
+        draw, row = np.repeat(np.arange(draws), len(rows)), np.tile(rows, draws)
+        signal = joined(signals, draw, row)
         q, v = simulate(
             self.system,
-            np.concatenate(q0)[rows],
-            np.concatenate(v0)[rows],
-            acting,
+            np.stack(q0)[draw, row],
+            np.stack(v0)[draw, row],
+            lambda times: signal(times - self.dead_time),
             t,
             rtol=self.rtol,
             atol=self.atol,
             compile=self.compile,
             q_limits=None if self.q_limits is None else np.array(self.q_limits, dtype=float),
-            progress=f"simulating {len(rows)} trajectories of {self.name}",
+            progress=f"simulating {len(row)} trajectories of {self.name}",
         )
         return q, v, signal(t)
-
-    def _replace(
-        self, motions: Sequence[np.ndarray], rngs: Mapping[str, np.random.Generator], t: np.ndarray
-    ) -> None:
-        """Replace the motions that leave the limits by new draws that stay within them."""
-        low, high = np.array(self.q_limits, dtype=float)
-
-        def stays(q: np.ndarray) -> np.ndarray:
-            return ((q >= low) & (q <= high)).all((1, 2))
-
-        q, drawn = motions[0], 1
-        while (left := np.flatnonzero(~stays(q))).size:
-            if drawn >= _DRAWS:
-                passed = ((q[left] < low) | (q[left] > high)).any((0, 1))
-                raise SimulationError(
-                    f"{self.name}: {left.size} of {len(q)} motions leave q_limits of "
-                    f"{', '.join(np.array(self.labels)[passed])} in each of {drawn} draws"
-                )
-            draws = [self._draw(rngs) for _ in range(_AT_ONCE)]
-            drawn += _AT_ONCE
-            rows = np.concatenate([left + k * len(q) for k in range(_AT_ONCE)])
-            new = self._move(draws, rows, t)
-            inside = stays(new[0]).reshape(_AT_ONCE, left.size)
-            replaced = inside.any(0)
-            first = (inside.argmax(0) * left.size + np.arange(left.size))[replaced]
-            for old, values in zip(motions, new, strict=True):
-                old[left[replaced]] = values[first]

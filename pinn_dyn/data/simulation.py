@@ -10,7 +10,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from pinn_dyn.data.excitation import Signal
+from pinn_dyn.data.excitation import InputSignal
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.progress import Progress
 
@@ -41,7 +41,7 @@ def simulate(
     system: MechanicalSystem,
     q0: np.ndarray,
     v0: np.ndarray,
-    signal: Signal,
+    signal: InputSignal,
     t: np.ndarray,
     *,
     rtol: float = 1e-8,
