@@ -20,7 +20,7 @@ from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data import DataSource, data_identity
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.evaluation.report import Origin
+from pinn_dyn.evaluation.report.page import Origin
 
 
 def data_hash(identity: Mapping[str, Any]) -> str:

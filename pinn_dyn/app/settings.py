@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pinn_dyn.evaluation import RolloutValidator
     from pinn_dyn.evaluation.motion_limits import JointValues, MotionLimits
     from pinn_dyn.mechanics import Predictor
-    from pinn_dyn.models.known import Structure
+    from pinn_dyn.models.structure import Structure
     from pinn_dyn.systems import RigidChain
     from pinn_dyn.training import LeastSquares, WindowLoss
 

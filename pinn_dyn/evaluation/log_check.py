@@ -3,151 +3,37 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat
 
 from pinn_dyn.data import logs
-from pinn_dyn.data.logs.averages import Averages, white_noise
+from pinn_dyn.data.logs.averages import white_noise
 from pinn_dyn.data.logs.delay import INTERVAL
 from pinn_dyn.data.logs.input_faults import input_faults
 from pinn_dyn.data.logs.measurement import Measurement, judged
-from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import log_numbers as numbers
+from pinn_dyn.evaluation.report.check_page import LogCheck
 from pinn_dyn.evaluation.rigid_excitation import MOST, RigidExcitation, rigid_excitation
 from pinn_dyn.evaluation.structure_check import compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
-from pinn_dyn.models.known import Structure
+from pinn_dyn.models.structure import Structure
 
 _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
 _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
 _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
-_ROWS = 50  # of a table in the terminal
-_RANK = {"stop": 0, "warning": 1, "ok": 2}
 # Column of the table of coordinates, its upper limit, and the text beyond it.
 _LIMITS = (
     ("noise / range", _NOISE, "its noise is {:.2g} % of its range"),
     ("test outside", _OUTSIDE, "{:.3g} % of the test is outside the training range"),
 )
 _judged = partial(judged, section="docs/bags_and_other_logs.md#is-the-log-good-enough")
-
-
-@dataclass(frozen=True)
-class LogCheck:
-    """Measurements of a log, and the numbers behind them.
-
-    Attributes:
-        source: the log.
-        measurements: the measurements, each with its verdict.
-        runs, coordinates, inputs: tables of stretches, coordinates and inputs.
-        delays: delay curve of each input.
-        steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
-        delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
-        options: options of a training: heads for dry friction or servos, if needed; none if an
-            angle turns too far in a sample for a step.
-        rigid: excitation of the base parameters of a rigid robot; None without a structure.
-        motion: averages of the motion, or None if it is too short for an equation of motion.
-        equations: equations of motion of the log.
-    """
-
-    source: logs.LogSource
-    measurements: list[Measurement]
-    runs: pd.DataFrame
-    coordinates: pd.DataFrame
-    inputs: pd.DataFrame
-    delays: list[logs.DelayCurve]
-    steps: list[str]
-    delay: float | list[float] | None
-    options: list[str]
-    rigid: RigidExcitation | None = None
-    motion: Averages | None = None
-    equations: Sequence[logs.Equation] = ()
-
-    @property
-    def problems(self) -> list[str]:
-        """Reasons why a training makes no sense."""
-        return [x.text for x in self.measurements if x.verdict == "stop"]
-
-    @property
-    def warnings(self) -> list[str]:
-        """Texts of the warnings."""
-        return [x.text for x in self.measurements if x.verdict == "warning"]
-
-    @property
-    def block(self) -> str:
-        """Entries to append to the YAML of the data set, "" if there are none."""
-        head = ["steps:"] if self.steps and not self.source.steps else []
-        lines = [*head, *(f"  {line}" for line in self.steps)]
-        lines += [] if self.delay is None else [f"delay: {self.delay} # s"]
-        return "\n".join(lines)
-
-    def table(self) -> pd.DataFrame:
-        """Return one row per measurement, stops and warnings first."""
-        frame = pd.DataFrame(self.measurements).rename(
-            columns={"name": "measurement", "place": "of", "text": "explanation", "section": "docs"}
-        )
-        frame.insert(0, "verdict", frame.pop("verdict"))
-        return frame.sort_values("verdict", key=lambda x: x.map(_RANK), kind="stable")
-
-    @property
-    def verdict(self) -> str:
-        """The verdict in one line."""
-        count = len(self.findings())
-        if self.problems:
-            return f"a training makes no sense: {'; '.join(self.problems)}"
-        notes = f"{count} warning{'s' * (count != 1)}" if count else "no warnings"
-        return f"a training makes sense, {notes}"
-
-    def findings(self) -> list[str]:
-        """Return what is not ok, stops first. Equal quantities of several places are one text."""
-        groups: dict[tuple[str, str], list[Measurement]] = {}
-        bad = sorted(self.measurements, key=lambda x: _RANK[x.verdict])
-        for item in (x for x in bad if x.verdict != "ok"):
-            groups.setdefault((item.name, _cause(item.text)), []).append(item)
-        texts = []
-        for items in groups.values():
-            first = items[0]
-            more = ", ".join(x.place for x in items[1:] if x.place) or f"{len(items) - 1} more"
-            also = f" The same: {more}." if len(items) > 1 else ""
-            texts.append(f"{first.verdict}: {first.text}.{also} ({first.section})")
-        return texts
-
-    def __str__(self) -> str:
-        lines = [f"{self.source.name}: {self.verdict}", *(f"\n{x}" for x in self.findings())]
-        tables = {"Coordinates": self.coordinates, "Inputs": self.inputs}
-        if self.rigid is not None:
-            tables[f"Rigid bodies, not determined: {self.rigid.undetermined}"] = self.rigid.joints
-        for title, frame in ((k, x) for k, x in tables.items() if len(x)):
-            text = frame.to_string(
-                index=False, na_rep="", float_format="{:.3g}".format, max_rows=_ROWS
-            )
-            lines += ["", title, text]
-        ok = sum(x.verdict == "ok" for x in self.measurements)
-        lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
-        if self.block:
-            lines += ["", "Append to the data set:", "", self.block]
-        if self.options and self.rigid is None:
-            lines += ["", f"Options of a training: model=lnn {' '.join(self.options)}"]
-        return "\n".join(lines)
-
-    def save(self, folder: str | Path, command: str = "") -> Path:
-        """Write ``check.html``, ``measurements.csv`` and ``log_report.md``; return the page."""
-        from pinn_dyn.evaluation.report.check_page import check_report
-
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "check.html", check_report(self, command=command))
-        write_whole(folder / "measurements.csv", self.table().to_csv(index=False))
-        write_whole(folder / "log_report.md", self.source.report)
-        return folder / "check.html"
 
 
 def check(
@@ -293,11 +179,6 @@ def _inputs_table(
         "method": [x.reason or x.form for x in delays],
     }
     return pd.DataFrame(table)
-
-
-def _cause(text: str) -> str:
-    """Return the part of a text that names a cause, without names and numbers of its place."""
-    return re.sub(r"[\d.]+|\S*[/\\']\S*", "", text.rpartition(": ")[2])
 
 
 def _run(part: logs.Cleaned) -> dict[str, object]:

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from pinn_dyn.evaluation.identification import named_directions
 from pinn_dyn.mechanics import Trajectory
-from pinn_dyn.models.known import INERTIAL, Structure
+from pinn_dyn.models.known import INERTIAL
+from pinn_dyn.models.structure import Structure
 from pinn_dyn.training.filtered_motion import filtered_motion
 from pinn_dyn.training.least_squares import REST
 

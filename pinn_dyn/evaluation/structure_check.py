@@ -14,7 +14,7 @@ from pinn_dyn.data.logs.delay import force_columns
 from pinn_dyn.data.logs.equation import EquationOfMotionRegression, Regressor
 from pinn_dyn.data.logs.input_faults import delayed
 from pinn_dyn.data.logs.measurement import Measurement, judged
-from pinn_dyn.models.known import Structure
+from pinn_dyn.models.structure import Structure
 from pinn_dyn.systems import RigidChain
 
 SECTION = "docs/known_mechanics.md#does-the-urdf-fit-the-log"

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec, spd_solve
-
-if TYPE_CHECKING:
-    from pinn_dyn.mechanics.system import MechanicalSystem
+from pinn_dyn.mechanics.mechanical_terms import MechanicalTerms
 
 _PASSES = 4
 """Number of passes of the active-set method."""
@@ -55,7 +52,7 @@ class Sliding:
     """
 
     def __init__(
-        self, system: MechanicalSystem, x: Tensor, inputs: Tensor, h: Tensor, implicit: bool = False
+        self, system: MechanicalTerms, x: Tensor, inputs: Tensor, h: Tensor, implicit: bool = False
     ):
         self.system, self.h = system, h
         q, v = x.chunk(2, dim=-1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, final
@@ -14,11 +13,10 @@ from pinn_dyn.mechanics.arrays import (
     matvec,
     pseudo_inverse_times,
     require_last_dim,
-    spd_solve,
     spd_solver,
 )
 from pinn_dyn.mechanics.input_solver import InputSolver, Solution
-from pinn_dyn.mechanics.predictor import ContinuousPredictor
+from pinn_dyn.mechanics.mechanical_terms import MechanicalTerms
 from pinn_dyn.mechanics.sliding import Sliding
 
 
@@ -31,7 +29,7 @@ class Terms(NamedTuple):
     A: Tensor
 
 
-class MechanicalSystem(ContinuousPredictor):
+class MechanicalSystem(MechanicalTerms):
     """A mechanical system with dissipation and an input matrix.
 
     Lagrangian form, paper eq. (armdynamics)::
@@ -53,93 +51,8 @@ class MechanicalSystem(ContinuousPredictor):
     If the force is not linear in the input, ``input_affine`` is false, and :meth:`input_matrix` is
     A at :meth:`typical_input`.
 
-    A subclass implements the four abstract terms. The ``_``-methods derive all other quantities by
-    automatic differentiation. A subclass with closed formulas may override them.
+    A subclass implements the four abstract terms, see :class:`MechanicalTerms`.
     """
-
-    input_affine: bool = True
-    sticking: bool = False
-    has_residual: bool = False
-
-    @abc.abstractmethod
-    def mass_matrix(self, q: Tensor) -> Tensor:
-        """Return M(q), ``(*batch, N, N)``, symmetric positive definite."""
-
-    @abc.abstractmethod
-    def potential_energy(self, q: Tensor) -> Tensor:
-        """Return V(q), ``(*batch,)``, J."""
-
-    @abc.abstractmethod
-    def damping_matrix(self, q: Tensor) -> Tensor:
-        """Return D(q), ``(*batch, N, N)``, symmetric positive semi-definite."""
-
-    @abc.abstractmethod
-    def input_matrix(self, q: Tensor) -> Tensor:
-        """Return A(q), ``(*batch, N, M)``."""
-
-    def typical_input(self, q: Tensor) -> Tensor:
-        """Return an input ``(*batch, M)`` where the search for an input with a force starts."""
-        return q.new_zeros(*q.shape[:-1], self.num_inputs)
-
-    def _potential_force(self, q: Tensor) -> Tensor:
-        return torch.func.grad(lambda x: self.potential_energy(x).sum())(q)
-
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """Return M(q) a + C(q, v) v, with C(q, v) v = (dM/dt) v - d(v^T M v / 2)/dq."""
-        mass, mass_rate = torch.func.jvp(self.mass_matrix, (q,), (v,))  # type: ignore[misc]
-        return matvec(mass, a) + matvec(mass_rate, v) - self._kinetic_gradient(q, v)
-
-    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        """Solve M(q) a + C(q, v) v + G(q) = force for a."""
-        mass, bias = self._mass_and_bias(q, v)
-        return spd_solve(mass, force - bias)
-
-    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Return M(q) and C(q, v) v + G(q)."""
-        bias = self._inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
-        return self.mass_matrix(q), bias
-
-    def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
-        return matvec(self.damping_matrix(q), v)
-
-    def _friction_force(self, v: Tensor) -> Tensor:
-        return torch.zeros_like(v)
-
-    def _friction_slope(self, v: Tensor) -> Tensor:
-        return torch.zeros_like(v)
-
-    def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
-        """Return the friction of coordinates that slide forward in a ``share`` of the time."""
-        return self._friction_force(v)
-
-    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        """Return stiff terms K(q) of dG/dq, ``(*batch, N, N)``, or None, for implicit methods."""
-        return None
-
-    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
-        return matvec(self.input_matrix(q), u)
-
-    def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return torch.zeros_like(v)
-
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        force = self._input_force(q, u)
-        return force + self._residual_force(q, v, u) if self.has_residual else force
-
-    def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Return dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v, and dH/dp = M^-1 p = v."""
-        v = self._velocity(q, p)
-        return self._potential_force(q) - self._kinetic_gradient(q, v), v
-
-    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
-        return matvec(self.mass_matrix(q), v)
-
-    def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        return spd_solve(self.mass_matrix(q), p)
-
-    def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return d(v^T M(q) v / 2)/dq at fixed v."""
-        return torch.func.grad(lambda x: 0.5 * (v * matvec(self.mass_matrix(x), v)).sum())(q)
 
     @final
     def terms(self, q: Tensor) -> Terms:
@@ -298,11 +211,6 @@ class MechanicalSystem(ContinuousPredictor):
         if self.state == "qp":
             return self.momentum_derivative(x, u)
         return self.velocity_derivative(x, u)
-
-    def _resistance(self, q: Tensor, step: Tensor) -> Tensor:
-        """Return D + s K, ``(*batch, N, N)``."""
-        damping, stiffness = self.damping_matrix(q), self._stiffness_matrix(q)
-        return damping if stiffness is None else damping + step * stiffness
 
     @final
     def sliding(self, x: Tensor, inputs: Tensor, h: Tensor, implicit: bool) -> Sliding:

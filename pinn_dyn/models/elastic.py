@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from pydantic import PositiveFloat
@@ -11,9 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from pinn_dyn.models.known_constants import Constants, PositiveConstants
-
-if TYPE_CHECKING:
-    from pinn_dyn.models.known import Structure
+from pinn_dyn.models.structure import Structure
 
 _RATE = 1e-3  # initial damping over stiffness, s
 _SPREAD = 2.0  # prior standard deviation of the logarithms

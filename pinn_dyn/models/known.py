@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import torch
 from pydantic import NonNegativeFloat, PositiveFloat
@@ -22,41 +22,12 @@ from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.scales import Joint, Scales
 from pinn_dyn.models.servo import Servo
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.models.structure import Structure
 from pinn_dyn.models.structured import FrictionHead
 
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the ten inertial parameters of a body."""
 _GENERIC_SPREAD = 3.0
-
-
-@runtime_checkable
-class Structure(Protocol):
-    """Rigid bodies with known kinematics. All terms are linear in their pseudo-inertias.
-
-    ``turning`` is true for each revolute joint. ``inertia`` are the pseudo-inertias ``(n, 4, 4)``,
-    ``body_joints`` the numbers of the joints that move the bodies.
-    """
-
-    num_coordinates: int
-    joint_names: list[str]
-    turning: list[bool]
-    body_names: list[str]
-    body_joints: list[int]
-    inertia: Tensor
-
-    def generic_inertia(self) -> Tensor: ...
-    def prior_inertia(self) -> Tensor: ...
-    def parameters_of(self, inertia: Tensor) -> Tensor: ...
-    def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor: ...
-    def potential_energy(self, q: Tensor, inertia: Tensor) -> Tensor: ...
-    def mass_and_bias(self, q: Tensor, v: Tensor, inertia: Tensor) -> tuple[Tensor, Tensor]: ...
-    def rigid_force(
-        self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor, gravity: bool
-    ) -> Tensor: ...
-    def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor: ...
-    def force_slopes(
-        self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor
-    ) -> tuple[Tensor, Tensor]: ...
 
 
 class KnownMechanics(LearnedConstants):

@@ -17,7 +17,8 @@ from pinn_dyn.evaluation import (
     evaluate_models,
 )
 from pinn_dyn.evaluation.baselines import HoldPosition
-from pinn_dyn.evaluation.report import Origin, control_report
+from pinn_dyn.evaluation.report.control_page import control_report
+from pinn_dyn.evaluation.report.page import Origin
 from pinn_dyn.evaluation.report.prediction_page import prediction_report
 from pinn_dyn.mechanics import Predictor, Signal, Trajectory
 from pinn_dyn.progress import Progress

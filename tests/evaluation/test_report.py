@@ -113,14 +113,15 @@ def test_the_slider_offers_the_median_and_the_worst_trajectories(prediction, mon
         drawn.append(trajectory)
         return Figure()
 
+    _, page, item = prediction
+    figures = dict(item.figures(2))
     monkeypatch.setattr("pinn_dyn.evaluation.report.prediction_page.trajectory_figure", figure)
     monkeypatch.setattr("pinn_dyn.evaluation.report.prediction_page.MAX_TRAJECTORIES", 3)
-    _, page, item = prediction
     pictures = [x["alt"] for tag, x in page.tags if tag == "img" and "alt" in x]
     assert [x for x in pictures if x.startswith("trajectory")] == [
         f"trajectory {k}" for k in range(5)
     ]
-    page = Page(prediction_report(item, dict(item.figures(2)), 2))
+    page = Page(prediction_report(item, figures, 2))
     lnn = item.models["lnn"].error().mean(dim=1)
     order = sorted(range(5), key=lambda k: (math.isnan(lnn[k]), float(lnn[k])))
     assert f"lnn: {order[2]}." in page.text.partition("Median")[2]

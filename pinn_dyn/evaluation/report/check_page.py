@@ -1,12 +1,20 @@
-"""The page of the check of a log."""
+"""Results of the check of a log: measurements, each with a verdict, and their page."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
-from pinn_dyn.data.logs.averages import PARTS
-from pinn_dyn.evaluation.log_check import LogCheck
+from pinn_dyn.data import logs
+from pinn_dyn.data.logs.averages import PARTS, Averages
+from pinn_dyn.data.logs.measurement import Measurement
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels
 from pinn_dyn.evaluation.report.page import (
@@ -19,7 +27,10 @@ from pinn_dyn.evaluation.report.page import (
     preformatted,
     table,
 )
+from pinn_dyn.evaluation.rigid_excitation import RigidExcitation
 
+_ROWS = 50  # of a table in the terminal
+_RANK = {"stop": 0, "warning": 1, "ok": 2}
 _DRAWN = 1000  # rows of the equation of motion
 _FORCES = (
     "The equation of motion is fitted to all runs. The residual is the part of an input that the "
@@ -30,6 +41,119 @@ _INPUTS = (
     "shifted by a delay. The delay is at its minimum. The column ± is half its 95 % interval. "
     "Dry friction is a share of the standard deviation of the input."
 )
+
+
+@dataclass(frozen=True)
+class LogCheck:
+    """Measurements of a log, and the numbers behind them.
+
+    Attributes:
+        source: the log.
+        measurements: the measurements, each with its verdict.
+        runs, coordinates, inputs: tables of stretches, coordinates and inputs.
+        delays: delay curve of each input.
+        steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
+        delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
+        options: options of a training: heads for dry friction or servos, if needed; none if an
+            angle turns too far in a sample for a step.
+        rigid: excitation of the base parameters of a rigid robot; None without a structure.
+        motion: averages of the motion, or None if it is too short for an equation of motion.
+        equations: equations of motion of the log.
+    """
+
+    source: logs.LogSource
+    measurements: list[Measurement]
+    runs: pd.DataFrame
+    coordinates: pd.DataFrame
+    inputs: pd.DataFrame
+    delays: list[logs.DelayCurve]
+    steps: list[str]
+    delay: float | list[float] | None
+    options: list[str]
+    rigid: RigidExcitation | None = None
+    motion: Averages | None = None
+    equations: Sequence[logs.Equation] = ()
+
+    @property
+    def problems(self) -> list[str]:
+        """Reasons why a training makes no sense."""
+        return [x.text for x in self.measurements if x.verdict == "stop"]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Texts of the warnings."""
+        return [x.text for x in self.measurements if x.verdict == "warning"]
+
+    @property
+    def block(self) -> str:
+        """Entries to append to the YAML of the data set, "" if there are none."""
+        head = ["steps:"] if self.steps and not self.source.steps else []
+        lines = [*head, *(f"  {line}" for line in self.steps)]
+        lines += [] if self.delay is None else [f"delay: {self.delay} # s"]
+        return "\n".join(lines)
+
+    def table(self) -> pd.DataFrame:
+        """Return one row per measurement, stops and warnings first."""
+        frame = pd.DataFrame(self.measurements).rename(
+            columns={"name": "measurement", "place": "of", "text": "explanation", "section": "docs"}
+        )
+        frame.insert(0, "verdict", frame.pop("verdict"))
+        return frame.sort_values("verdict", key=lambda x: x.map(_RANK), kind="stable")
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in one line."""
+        count = len(self.findings())
+        if self.problems:
+            return f"a training makes no sense: {'; '.join(self.problems)}"
+        notes = f"{count} warning{'s' * (count != 1)}" if count else "no warnings"
+        return f"a training makes sense, {notes}"
+
+    def findings(self) -> list[str]:
+        """Return what is not ok, stops first. Equal quantities of several places are one text."""
+        groups: dict[tuple[str, str], list[Measurement]] = {}
+        bad = sorted(self.measurements, key=lambda x: _RANK[x.verdict])
+        for item in (x for x in bad if x.verdict != "ok"):
+            groups.setdefault((item.name, _cause(item.text)), []).append(item)
+        texts = []
+        for items in groups.values():
+            first = items[0]
+            more = ", ".join(x.place for x in items[1:] if x.place) or f"{len(items) - 1} more"
+            also = f" The same: {more}." if len(items) > 1 else ""
+            texts.append(f"{first.verdict}: {first.text}.{also} ({first.section})")
+        return texts
+
+    def __str__(self) -> str:
+        lines = [f"{self.source.name}: {self.verdict}", *(f"\n{x}" for x in self.findings())]
+        tables = {"Coordinates": self.coordinates, "Inputs": self.inputs}
+        if self.rigid is not None:
+            tables[f"Rigid bodies, not determined: {self.rigid.undetermined}"] = self.rigid.joints
+        for title, frame in ((k, x) for k, x in tables.items() if len(x)):
+            text = frame.to_string(
+                index=False, na_rep="", float_format="{:.3g}".format, max_rows=_ROWS
+            )
+            lines += ["", title, text]
+        ok = sum(x.verdict == "ok" for x in self.measurements)
+        lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
+        if self.block:
+            lines += ["", "Append to the data set:", "", self.block]
+        if self.options and self.rigid is None:
+            lines += ["", f"Options of a training: model=lnn {' '.join(self.options)}"]
+        return "\n".join(lines)
+
+    def save(self, folder: str | Path, command: str = "") -> Path:
+        """Write ``check.html``, ``measurements.csv`` and ``log_report.md``; return the page."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / "check.html", check_report(self, command=command))
+        write_whole(folder / "measurements.csv", self.table().to_csv(index=False))
+        write_whole(folder / "log_report.md", self.source.report)
+        return folder / "check.html"
+
+
+def _cause(text: str) -> str:
+    """Return the part of a text that names a cause, without names and numbers of its place."""
+    return re.sub(r"[\d.]+|\S*[/\\']\S*", "", text.rpartition(": ")[2])
 
 
 def check_report(check: LogCheck, *, command: str) -> str:

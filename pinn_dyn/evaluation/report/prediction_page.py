@@ -1,18 +1,25 @@
-"""The page of an evaluation: trained models on trajectories that no training saw."""
+"""Results of an evaluation on trajectories that no training saw: tables, figures and a page."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from pinn_dyn.evaluation.figures import ERROR, trajectory_figure
+from pinn_dyn.data import DataSource
+from pinn_dyn.data.whole import write_whole
+from pinn_dyn.evaluation.calibration import Calibration, calibration_figure
+from pinn_dyn.evaluation.figures import ERROR, error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.identification import OPEN
-from pinn_dyn.evaluation.plots import with_unit
+from pinn_dyn.evaluation.learned_terms import TermComparison
+from pinn_dyn.evaluation.plots import save, with_unit
+from pinn_dyn.evaluation.prediction import Prediction
 from pinn_dyn.evaluation.report.page import (
     Section,
     details,
@@ -22,11 +29,16 @@ from pinn_dyn.evaluation.report.page import (
     slider,
     table,
 )
-from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns, unbeaten_baselines
+from pinn_dyn.evaluation.tables import (
+    SEEDS_COLUMNS,
+    summary_columns,
+    to_text,
+    unbeaten_baselines,
+    write_table,
+)
+from pinn_dyn.mechanics import Trajectory
 
-if TYPE_CHECKING:
-    from pinn_dyn.evaluation.evaluation import Evaluation
-
+SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
 MAX_TRAJECTORIES = 20
 """Largest number of trajectories that the slider offers."""
 _TORQUE = (
@@ -37,6 +49,124 @@ _PARTS = (
     "RMS of the forces of the parts of a sum along the test motions. A network with a large share "
     "shows that the known mechanics lack something, or have wrong constants."
 )
+
+
+@dataclass
+class Evaluation:
+    """Results of an evaluation.
+
+    Attributes:
+        source: the data set.
+        split: ``test`` or ``validation``.
+        truth: the K trajectories stacked, q ``(K, T, N)``.
+        summary: one row per run and baseline, with all metrics.
+        by_model: mean and standard deviation over seeds.
+        torque: torque errors, one row per run and joint; empty without mechanical models.
+        ensembles: errors and spreads of members, one row per ensemble; empty without ensembles.
+        parts: contributions of the parts of sums, one row per run, part and term.
+        predictions: rollouts by name of the row, baselines included.
+        intervals: calibration by run and window in s; runs without members have none.
+        terms: learned terms beside the true ones, by run; empty where the truth is unknown.
+        constants: tables of fitted constants, by run.
+        origin: command, commit, data and configurations, for the page.
+    """
+
+    source: DataSource
+    split: str
+    truth: Trajectory
+    summary: pd.DataFrame
+    by_model: pd.DataFrame
+    torque: pd.DataFrame
+    ensembles: pd.DataFrame
+    parts: pd.DataFrame
+    predictions: dict[str, Prediction]
+    intervals: dict[str, dict[float, Calibration]]
+    terms: dict[str, TermComparison]
+    constants: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    origin: Any = None
+
+    @property
+    def models(self) -> dict[str, Prediction]:
+        """Rollouts of the trained models."""
+        names = self.summary["run"][~self.summary["baseline"]]
+        return {name: self.predictions[name] for name in names}
+
+    @property
+    def baselines(self) -> dict[str, Prediction]:
+        """Rollouts of the baselines."""
+        return {k: item for k, item in self.predictions.items() if k not in self.models}
+
+    @property
+    def best_baseline(self) -> dict[str, Prediction]:
+        """Rollouts of the most accurate baseline with the fewest diverged trajectories."""
+        rows = self.summary[self.summary["baseline"]].sort_values(["diverged", "error_mean"])
+        return {name: self.predictions[name] for name in rows["run"][:1]}
+
+    @property
+    def trajectories(self) -> str:
+        """Number and kind of the trajectories, for titles."""
+        return f"{len(self.truth.q)} {SPLITS[self.split]}, {self.truth.duration:g} s open loop"
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.source.name}: {self.trajectories}",
+            to_text(self.summary, summary_columns(self.summary)),
+            "* best in its column, and better than all baselines (in brackets)",
+            *unbeaten_baselines(self.summary),
+        ]
+        if len(self.by_model) < len(self.summary):
+            lines += ["", "over seeds:", to_text(self.by_model, SEEDS_COLUMNS)]
+        return "\n".join(lines)
+
+    def figures(self, trajectory: int = 0) -> Iterator[tuple[str, Figure]]:
+        """Yield the names of all figures, and the figures; one draws a single ``trajectory``."""
+        title = f"{self.source.name}, {self.trajectories}"
+        labels = self.source.labels
+        yield (
+            "trajectory",
+            trajectory_figure(
+                self.truth,
+                self.models,
+                trajectory=trajectory,
+                title=f"{self.source.name}, {self.split} trajectory {trajectory}, open loop",
+                labels=labels,
+                input_labels=self.source.input_labels,
+                baselines=self.best_baseline,
+            ),
+        )
+        error = with_unit(ERROR, labels)
+        figure = error_figure(self.models, baselines=self.baselines, title=title, label=error)
+        yield "error", figure
+        if self.intervals:
+            yield "calibration", calibration_figure(self.intervals, title=title)
+        for run, comparison in self.terms.items():
+            for k, name in enumerate(comparison.names):
+                text = f"{run}: learned and true terms, {name}"
+                figure = terms_figure(comparison, configuration=k, title=text)
+                yield f"terms_{_stem(run)}_{name}", figure
+
+    def save(self, folder: str | Path, trajectory: int = 0) -> None:
+        """Write the tables as CSV, the figures as PNG, and the page ``report.html``."""
+        folder = Path(folder)
+        tables = {
+            "summary": self.summary,
+            "by_model": self.by_model,
+            "torque": self.torque,
+            "ensembles": self.ensembles,
+            "parts": self.parts,
+        }
+        tables |= {f"terms_{_stem(run)}": x.to_frame() for run, x in self.terms.items()}
+        for stem, frame in tables.items():
+            if len(frame):
+                write_table(frame, folder, stem)
+        figures = dict(self.figures(trajectory))
+        for name, figure in figures.items():
+            save(figure, folder / f"{name}.png")
+        write_whole(folder / "report.html", prediction_report(self, figures, trajectory))
+
+
+def _stem(run: str) -> str:
+    return "".join(c if c.isalnum() or c in "-.=" else "_" for c in run)
 
 
 def prediction_report(
