@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
 
 import torch
 from pydantic import PositiveFloat
@@ -13,14 +13,6 @@ from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.laws import ModelBasedLaw
 from pinn_dyn.mechanics.arrays import matvec, pseudo_inverse_times
-
-
-class _Memory(NamedTuple):
-    t: float
-    momentum: Tensor
-    force: Tensor
-    A: Tensor
-    u: Tensor
 
 
 class DisturbanceObserver(Controller):
@@ -63,6 +55,9 @@ class DisturbanceObserver(Controller):
         bandwidth, max_rate: as above; the rate is infinite without a limit.
     """
 
+    _finish: Callable[[Tensor], Tensor]
+    _u: Tensor
+
     def __init__(
         self,
         law: ModelBasedLaw,
@@ -78,13 +73,18 @@ class DisturbanceObserver(Controller):
         self.bandwidth = float(bandwidth)
         self.max_rate = math.inf if max_rate is None else float(max_rate)
         self._actuator = actuator
-        self.residual: Tensor | None = None
-        self._size: Tensor | None = None
-        self._memory: _Memory | None = None
+        self.memory_size = 1 + 3 * law.num_coordinates
+        self._forget()
 
     def reset(self) -> None:
         self.law.reset()
         self._forget()
+
+    def _forget(self) -> None:
+        self.residual: Tensor | None = None
+        self._time, self._period = -math.inf, 1.0
+        if self._actuator is not None:
+            self._actuator.reset()
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
@@ -92,54 +92,72 @@ class DisturbanceObserver(Controller):
         Raises:
             ValueError: on a time before the previous call.
         """
-        u = self.law(t, q, v, reference)
-        last = self._memory
-        if last is not None and t < last.t:
+        u_law = self.law(t, q, v, reference)
+        if t < self._time:
             raise ValueError(
-                f"t is {t:g} s, before the previous call at {last.t:g} s: reset() the observer "
+                f"t is {t:g} s, before the previous call at {self._time:g} s: reset() the observer "
                 "before a new run, and give a rate, since it cannot act in continuous time"
             )
-        model = self.law.model
         with torch.no_grad():
-            momentum, A = model.momentum(q, v), model.input_matrix(q)
-            # The part of dp/dt without the input: C^T v - G - D v.
-            state = torch.cat([q, momentum], dim=-1)
-            force = model.momentum_derivative(state, torch.zeros_like(u))[..., q.shape[-1] :]
-            if last is None or self.residual is None or last.momentum.shape != q.shape:
+            if self.residual is None or self.residual.shape != q.shape:
                 self._forget()
-                self.residual = torch.zeros_like(q)
-            elif t > last.t:
-                period = t - last.t
-                applied = last.u
+                self._memory = q.new_zeros(*q.shape[:-1], self.memory_size)
+                self._applied = torch.zeros_like(u_law)
+            elif t > self._time:
+                self._period, self._applied = t - self._time, self._u
                 if self._actuator is not None:
-                    applied, _ = self._actuator(applied, period)
-                modeled = 0.5 * (last.force + force + matvec(last.A + A, applied))
-                disturbance = (momentum - last.momentum) / period - modeled
-                gain = -math.expm1(-self.bandwidth * period)
-                change = gain * (disturbance - self.residual)
-                limit = self.max_rate * period
-                self.residual = self.residual + change.clamp(-limit, limit)
-            compensation = pseudo_inverse_times(A, self.residual)
-            u = u - compensation
-        self._size = torch.linalg.vector_norm(compensation, dim=-1)
-        self._memory = _Memory(t, momentum, force, A, u)
+                    self._applied, _ = self._actuator(self._u, self._period)
+                self._memory = self._finish(self._applied)
+            u, self._finish = self.correct(q, v, u_law, self._applied, self._memory, self._period)
+            self.residual = self._finish(u)[..., 1 : q.shape[-1] + 1]
+        self._time, self._u = t, u
+        self._size = torch.linalg.vector_norm(u_law - u, dim=-1)
         return u
+
+    def correct(
+        self, q: Tensor, v: Tensor, u: Tensor, last: Tensor, memory: Tensor, period: float
+    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Correct the law's u ``(*batch, M)``, without side effects.
+
+        Args:
+            q, v: state, ``(*batch, N)``.
+            u: input of the law, ``(*batch, M)``.
+            last: input that was applied since the previous call, ``(*batch, M)``.
+            memory: zero before the first call; then 1, r, M v and (f + A u) / 2, side by side.
+            period: T, s.
+
+        Returns:
+            u - A^+ r, and a function from the applied input to the memory for the next call.
+        """
+        model, n = self.law.model, q.shape[-1]
+        started, residual, last_momentum, last_force = memory.split([1, n, n, n], dim=-1)
+        momentum, A = model.momentum(q, v), model.input_matrix(q)
+        # The part of dp/dt without the input: C^T v - G - D v.
+        state = torch.cat([q, momentum], dim=-1)
+        force = model.momentum_derivative(state, torch.zeros_like(u))[..., n:]
+        modeled = last_force + 0.5 * (force + matvec(A, last))
+        disturbance = (momentum - last_momentum) / period - modeled
+        change = -math.expm1(-self.bandwidth * period) * (disturbance - residual)
+        limit = self.max_rate * period
+        if math.isfinite(limit):
+            change = change.clamp(-limit, limit)
+        residual = residual + started * change
+
+        def finish(applied: Tensor) -> Tensor:
+            half = 0.5 * (force + matvec(A, applied))
+            return torch.cat([torch.ones_like(started), residual, momentum, half], dim=-1)
+
+        return u - pseudo_inverse_times(A, residual), finish
 
     def replace_input(self, u: Tensor) -> None:
         """Set the input that acts in place of that of the latest call, ``(*batch, M)``."""
-        if self._memory is not None:
-            self._memory = self._memory._replace(u=u)
+        self._u = u
 
     def diagnostics(self) -> dict[str, Tensor]:
         """Return the law's diagnostics and ``compensation``, |A^+ r| in the units of u."""
-        if self._size is None:
+        if self.residual is None:
             return {}
         return self.law.diagnostics() | {"compensation": self._size}
 
     def faults(self) -> dict[str, Tensor]:
         return self.law.faults()
-
-    def _forget(self) -> None:
-        self.residual = self._size = self._memory = None
-        if self._actuator is not None:
-            self._actuator.reset()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -14,7 +11,6 @@ from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.laws import ModelBasedLaw
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.region import Guarded
-from pinn_dyn.mechanics.arrays import matvec, pseudo_inverse_times
 
 LIMITED, OUTSIDE, NOT_FINITE = 1, 2, 4
 """Bits of the status."""
@@ -34,9 +30,8 @@ class SafeLaw:
     time, and the memory holds the last n inputs instead of the last one.
 
     The status is the sum of 1 (the actuator changed u), 2 (outside the training data) and 4 (not
-    finite). The memory is zero before the first call. It holds the last u ``(M,)``. An observer
-    adds 1 after the first call, and r, M v and (f + A u) / 2, ``(N,)`` each. The observer
-    computes as :class:`DisturbanceObserver` with the limits of the actuator.
+    finite). The memory is zero before the first call. It holds the last u ``(M,)`` and the memory
+    of the observer, see :meth:`DisturbanceObserver.correct`.
 
     Args:
         controller: a law of a model, also with an observer, a guard or a DelayCompensation.
@@ -72,7 +67,9 @@ class SafeLaw:
             raise ValueError("an observer or a limited rate needs a fixed period: give a rate")
         self.period = period
         self.stored_inputs = law.num_inputs * (self.compensation.size if self.compensation else 1)
-        self.memory_size = self.stored_inputs + (1 + 3 * law.num_coordinates) * bool(self.observer)
+        self.memory_size = self.stored_inputs
+        if self.observer:
+            self.memory_size += self.observer.memory_size
 
     def __call__(
         self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor, memory_in: Tensor
@@ -86,7 +83,7 @@ class SafeLaw:
             q, v = self.compensation.predict(q, v, past)
         u = self.law.law(q, v, *reference, last)
         if self.observer:
-            u, finish = self._observed(self.observer, q, v, u, last, memory)
+            u, finish = self.observer.correct(q, v, u, last, memory, self.period or 0.0)
         status = torch.zeros_like(q[0])
         if self.guard:
             outside = self.guard.region.nearest(q, v) > self.guard.threshold
@@ -104,32 +101,3 @@ class SafeLaw:
         if self.compensation:
             output, stored = self.compensation.applied(past, applied)
         return output, status, torch.cat([stored.flatten(), memory])
-
-    def _observed(
-        self,
-        observer: DisturbanceObserver,
-        q: Tensor,
-        v: Tensor,
-        u: Tensor,
-        last: Tensor,
-        memory: Tensor,
-    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Return the corrected u, and a function from the applied u to the observer's memory."""
-        model, n, period = self.law.model, len(q), self.period or 0.0
-        started, residual, last_momentum, last_force = memory.split([1, n, n, n])
-        momentum, A = model.momentum(q, v), model.input_matrix(q)
-        state = torch.cat([q, momentum])
-        force = model.momentum_derivative(state, torch.zeros_like(u))[n:]
-        modeled = last_force + 0.5 * (force + matvec(A, last))
-        disturbance = (momentum - last_momentum) / period - modeled
-        change = -math.expm1(-observer.bandwidth * period) * (disturbance - residual)
-        limit = observer.max_rate * period
-        if math.isfinite(limit):
-            change = change.clamp(-limit, limit)
-        residual = residual + started * change
-
-        def finish(applied: Tensor) -> Tensor:
-            half = 0.5 * (force + matvec(A, applied))
-            return torch.cat([torch.ones_like(started), residual, momentum, half])
-
-        return u - pseudo_inverse_times(A, residual), finish
