@@ -150,7 +150,8 @@ class Guarded(Controller):
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         u = self.law(t, q, v, reference)
         self._distance = self.region.distance(q, v)
-        outside = self._distance > self.threshold
+        last = torch.zeros_like(u) if self._last is None else self._last
+        u, outside = self.replaced(q, v, reference, u, last, self._distance)
         if outside.any() and not self._warned:
             self._warned = True
             log.warning(
@@ -158,20 +159,28 @@ class Guarded(Controller):
                 f"training data, at distances up to {float(self._distance.nan_to_num().max()):.3g} "
                 f"(1: edge of the data, {self.threshold:g}: threshold of the guard)"
             )
-        if self.fallback:
-            last = torch.zeros_like(u) if self._last is None else self._last
-            u = torch.where(outside.unsqueeze(-1), self.fall_back(q, v, reference, u, last), u)
-            if self._observer:
-                self._observer.replace_input(u)
+        if self._observer:
+            self._observer.replace_input(u)
         self._last = u
         return u
 
-    def fall_back(self, q: Tensor, v: Tensor, reference: Motion, u: Tensor, last: Tensor) -> Tensor:
-        """Return the input outside the data, ``(*batch, M)``, from the law's u and the last u."""
-        if self.fallback == "hold":
-            return last
-        with torch.no_grad():
-            return self._regulation.law(q, v, *reference, last) if self.fallback else u
+    def replaced(
+        self, q: Tensor, v: Tensor, reference: Motion, u: Tensor, last: Tensor, distance: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the law's u ``(*batch, M)``, replaced outside the data, and where that is.
+
+        Args:
+            q, v, reference: state and desired motion, ``(*batch, N)`` each.
+            u, last: input of the law, and the last input, ``(*batch, M)``.
+            distance: distance from the data, ``(*batch,)``.
+        """
+        outside = distance > self.threshold
+        if self.fallback is None:
+            return u, outside
+        if self.fallback == "regulation":
+            with torch.no_grad():
+                last = self._regulation.law(q, v, *reference, last)
+        return torch.where(outside.unsqueeze(-1), last, u), outside
 
     def diagnostics(self) -> dict[str, Tensor]:
         """Return those of the law, ``distance``, and ``outside`` as 0 or 1."""

@@ -86,9 +86,9 @@ class SafeLaw:
             u, finish = self.observer.correct(q, v, u, last, memory, self.period or 0.0)
         status = torch.zeros_like(q[0])
         if self.guard:
-            outside = self.guard.region.nearest(q, v) > self.guard.threshold
+            distance = self.guard.region.nearest(q, v)
+            u, outside = self.guard.replaced(q, v, reference, u, last, distance)
             status = status + OUTSIDE * outside
-            u = torch.where(outside, self.guard.fall_back(q, v, reference, u, last), u)
         finite = u.abs().sum() < torch.inf  # CasADi takes u - u for zero, also of NaN
         status = status + NOT_FINITE * ~finite
         u = torch.where(finite, u, last)
