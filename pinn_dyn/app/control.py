@@ -70,14 +70,9 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     count = len(reference(0.0).q.reshape(-1, robot.num_coordinates) if q0 is None else q0)
     if config["trajectory"] >= count:
         raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
-    laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
-    if config["guard"].get("threshold") is not None:
-        laws["learned"] = _guarded(laws["learned"], config, source)
+    laws = {name: _law(name, run, config, learned, source.system) for name in config["controllers"]}
     if config["export"]:
-        _export(laws[config["exported_law"]], learned, run, config)
-    for name, part in config["controllers"].items():
-        model = learned if part["terms"] == "learned" else source.system
-        laws[name] = _compensated(laws[name], model, run, config)
+        _export(laws[config["exported_law"]], run, config)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
     noisy = np.any(sensor.q_noise) or np.any(sensor.v_noise)
     result = close_loops(
@@ -135,8 +130,7 @@ def _without_robot(
     """Export the law on a model of measured data, and write how well it is conditioned."""
     source = run.source
     if config["export"]:
-        law = build_law(config, config["exported_law"], learned, learned)
-        _export(law, learned, run, config)
+        _export(_law(config["exported_law"], run, config, learned, learned), run, config)
     q = torch.cat([_thinned(item.q) for item in source.load().train])
     table = term_conditions(learned, q)
     table.to_csv(folder / "conditions.csv", index=False)
@@ -150,19 +144,27 @@ def _without_robot(
     return float("nan")
 
 
-def _compensated(
-    law: Controller, model: MechanicalSystem, run: Run, config: dict[str, Any]
+def _law(
+    name: str,
+    run: Run,
+    config: dict[str, Any],
+    learned: MechanicalSystem,
+    truth: MechanicalSystem,
 ) -> Controller:
+    """Build a law with its observer, guard and compensation of the delay, for loop and export."""
+    law = build_law(config, name, learned, truth)
+    guarded = {"learned", config["exported_law"]} if config["export"] else {"learned"}
+    if config["guard"].get("threshold") is not None and name in guarded:
+        law = _guarded(law, config, run.source)
+    model = learned if config["controllers"][name]["terms"] == "learned" else truth
     actuator = build_part("actuator", config["actuator"])
     return compensated(law, model, run.input_delay, config["rate"], actuator)
 
 
-def _export(law: Controller, learned: MechanicalSystem, run: Run, config: dict[str, Any]) -> None:
+def _export(law: Controller, run: Run, config: dict[str, Any]) -> None:
     try:
-        if config["guard"].get("threshold") is not None and not isinstance(law, Guarded):
-            law = _guarded(law, config, run.source)
         path = export_law(
-            _compensated(law, learned, run, config),
+            law,
             config["export"],
             actuator=build_part("actuator", config["actuator"]),
             period=config["rate"] and 1 / config["rate"],
