@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
+from pinn_dyn.data.fingerprint import plain
 
 
 def described(value: Any) -> Any:
@@ -19,16 +17,12 @@ def described(value: Any) -> Any:
     A class or a ``functools.partial`` gets ``_partial_: true``. An object is described by the
     attributes that have the names of its constructor's arguments.
     """
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
+    return plain(value, _described_object)
+
+
+def _described_object(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
-    if isinstance(value, (torch.Tensor, np.ndarray, np.generic)):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): described(item) for key, item in value.items()}
-    if isinstance(value, Sequence):
-        return [described(item) for item in value]
     if isinstance(value, partial):
         if value.args:
             raise TypeError(f"{value} has positional arguments, expected arguments by name")

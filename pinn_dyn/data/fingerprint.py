@@ -7,7 +7,7 @@ import hashlib
 import marshal
 import sys
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,23 @@ def describe(value: object) -> Any:
     Raises:
         TypeError: on an object that cannot be pickled; give its class a method ``describe()``.
     """
+    return plain(value, _described_object)
+
+
+def plain(value: object, describe_object: Callable[[Any], Any]) -> Any:
+    """Convert tensors, mappings and sequences to JSON, and other objects by a function."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, (torch.Tensor, np.ndarray, np.generic)):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): describe(item) for key, item in value.items()}
+        return {str(key): plain(item, describe_object) for key, item in value.items()}
     if isinstance(value, Sequence):
-        return [describe(item) for item in value]
+        return [plain(item, describe_object) for item in value]
+    return describe_object(value)
+
+
+def _described_object(value: Any) -> Any:
     if isinstance(value, (type, types.FunctionType)):
         return _definition(value)
     if hasattr(value, "describe"):

@@ -68,10 +68,10 @@ def to_si(unit: str) -> tuple[str, float]:
 
 STRICT = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 Finite = Annotated[float, AllowInfNan(False)]
-_Described = TypeVar("_Described")
+_Kind = TypeVar("_Kind")
 
 
-def described(kind: type[_Described], name: str, value: _Described | Mapping[str, Any]) -> Any:
+def validated(kind: type[_Kind], name: str, value: _Kind | Mapping[str, Any]) -> Any:
     """Return an object of a class, built from a mapping of its arguments if need be.
 
     Raises:

@@ -17,7 +17,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from pinn_dyn.data.logs import plausibility
 from pinn_dyn.data.logs.cleaning import clean, long_enough
 from pinn_dyn.data.logs.clock import InputDelay
-from pinn_dyn.data.logs.columns import UNITS, Columns, described
+from pinn_dyn.data.logs.columns import UNITS, Columns, validated
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
@@ -110,12 +110,12 @@ class LogSource(DataSource):
             time = {"columns": time}
         if isinstance(time, Columns) and not isinstance(time, Clock):
             time = asdict(time)
-        self.time: Clock = described(Clock, "time", time)
-        self.q: Columns = described(Columns, "q", q)
-        self.u: Columns = described(Columns, "u", u or {"columns": [], "unit": []})
+        self.time: Clock = validated(Clock, "time", time)
+        self.q: Columns = validated(Columns, "q", q)
+        self.u: Columns = validated(Columns, "u", u or {"columns": [], "unit": []})
         self.v: Columns | None = None
         if v is not None:
-            self.v = described(Columns, "v", v).in_order_of(self.q.columns)
+            self.v = validated(Columns, "v", v).in_order_of(self.q.columns)
         signals = {"q": self.q, "v": self.v, "u": self.u}
         self._signals = {key: columns for key, columns in signals.items() if columns is not None}
         self._check_units()
@@ -128,8 +128,8 @@ class LogSource(DataSource):
         self._repairs = {fault for step in self.steps.values() for fault in step.repairs}
         if (validation is None) != (test is None):
             raise LogError("expected both validation and test, or neither for the default split")
-        self.validation: Any = validation and described(Part, "validation", validation)
-        self.test: Any = test and described(Part, "test", test)
+        self.validation: Any = validation and validated(Part, "validation", validation)
+        self.test: Any = test and validated(Part, "test", test)
         self.guard = guard
         self.shortest = shortest
         self.seed = seed
