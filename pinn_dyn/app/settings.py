@@ -79,20 +79,26 @@ for _name in ("lightning.Trainer", "lightning.pytorch.trainer.trainer.Trainer"):
 
 
 @dataclass(kw_only=True)
-class EvaluateSettings:
+class _RunSettings:
+    """Keys of a command that reads run folders."""
+
+    checkpoint: Literal["best", "last"]
+    trajectory: NonNegativeInt
+    threads: PositiveInt
+    trust: Names | None = None
+
+
+@dataclass(kw_only=True)
+class EvaluateSettings(_RunSettings):
     """Keys of evaluate.py."""
 
     runs: Names
-    checkpoint: Literal["best", "last"]
     split: Literal["test", "validation"]
     dataset: DataSource | None = None
     horizon: PositiveFloat | None
     step: PositiveFloat | None
     windows: Sequence[PositiveFloat] | None
     thresholds: Mapping[str, PositiveFloat]
-    trajectory: NonNegativeInt
-    threads: PositiveInt
-    trust: Names | None = None
 
 
 @dataclass(kw_only=True)
@@ -131,11 +137,10 @@ class Stability:
 
 
 @dataclass(kw_only=True)
-class ControlSettings:
+class ControlSettings(_RunSettings):
     """Keys of control.py."""
 
     run: str
-    checkpoint: Literal["best", "last"]
     member: NonNegativeInt
     gains: Gains | Mapping[str, Any]
     duration: PositiveFloat
@@ -154,10 +159,7 @@ class ControlSettings:
     exported_law: str
     export_real: Literal["double", "float"]
     settled_after: NonNegativeFloat
-    trajectory: NonNegativeInt
     animate: bool
-    threads: PositiveInt
-    trust: Names | None = None
     controllers: Mapping[str, Law | Mapping[str, Any]]
     reference: Reference | Callable[..., Reference]
     plant: Plant | Callable[..., Plant] | None

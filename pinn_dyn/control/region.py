@@ -54,7 +54,8 @@ class DataRegion:
     ):
         self.num_coordinates = int(q[0].shape[-1])
         self.angles = sorted(angles)
-        states = np.concatenate([self._features(*pair) for pair in zip(q, v, strict=True)])
+        pairs = zip(q, v, strict=True)
+        states = torch.cat([self._features(*pair) for pair in pairs]).cpu().double().numpy()
         spread = states.std(axis=0)
         if self.angles:  # sine and cosine in one unit, that of the angle where it moves little
             sine, cosine = np.split(spread[-2 * len(self.angles) :], 2)
@@ -81,26 +82,24 @@ class DataRegion:
         """Return the distance from the data, ``(*batch,)``, 1 at the edge; NaN for a NaN state."""
         require_last_dim("q", q, self.num_coordinates, "N")
         require_last_dim("v", v, self.num_coordinates, "N")
-        states = self._features(q, v) / self._scale
+        states = self._features(q.double(), v.double()).detach().cpu().numpy() / self._scale
         finite = np.asarray(np.isfinite(states).all(axis=-1))
         nearest, _ = self._tree.query(np.where(finite[..., None], states, 0.0))
         return torch.as_tensor(np.where(finite, nearest / self.radius, np.nan)).to(q)
 
     def nearest(self, q: Tensor, v: Tensor) -> Tensor:
         """Return the distance ``()`` of a state ``(N,)`` by tensor operations, for exports."""
-        x = torch.cat([q, v])
-        linear = [k for k in range(len(x)) if k not in self.angles]
-        features = torch.cat([x[linear], x[self.angles].sin(), x[self.angles].cos()])
+        features = self._features(q, v)
         states = np.resize(self._tree.data, (-(-self._tree.n // _COLUMN) * _COLUMN, len(features)))
         offset = (features / torch.from_numpy(self._scale)).unsqueeze(-1) - torch.tensor(states.T)
         squares = (offset * offset).sum(0).reshape(-1, _COLUMN)
         return squares.amin(0).amin(0).sqrt() / self.radius
 
-    def _features(self, q: Tensor, v: Tensor) -> np.ndarray:
-        x = torch.cat([q, v], dim=-1).detach().cpu().double().numpy()
+    def _features(self, q: Tensor, v: Tensor) -> Tensor:
+        x = torch.cat([q, v], dim=-1)
+        linear = [k for k in range(x.shape[-1]) if k not in self.angles]
         angles = x[..., self.angles]
-        linear = np.delete(x, self.angles, axis=-1)
-        return np.concatenate([linear, np.sin(angles), np.cos(angles)], axis=-1)
+        return torch.cat([x[..., linear], angles.sin(), angles.cos()], dim=-1)
 
 
 class Guarded(Controller):

@@ -145,7 +145,7 @@ def test_an_input_matrix_of_the_wrong_sign_fails_condition_1_and_says_so():
     assert not (prediction["slowest_pole"] < 0).any()
     # A finite radius alone is no claim: nothing is counted where the conditions fail.
     assert np.isfinite(prediction["bound"]).any()
-    text = stability_report("Stability", table, prediction, torch.full((5,), 100.0))
+    text = stability_report("Stability", table, prediction, torch.full((5,), 100.0), {})
     assert re.search(r"condition 1, .* \| 0 of 5 \|", text)
     assert "| conditions hold | 0 of 5 |" in text
     assert "measured above the bound | 0 of 0 |" in text, text

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,7 +82,7 @@ class LogSource(DataSource):
         name: str | None = None,
         files: str | Sequence[str] | pd.DataFrame | Mapping[str, pd.DataFrame],
         root: str = ".",
-        time: Clock | Columns | Mapping[str, Any] | str,
+        time: Clock | Mapping[str, Any] | str,
         q: Columns | Mapping[str, Any],
         u: Columns | Mapping[str, Any] | Sequence[str] | None,
         v: Columns | Mapping[str, Any] | None = None,
@@ -108,8 +107,6 @@ class LogSource(DataSource):
         self.root = root
         if isinstance(time, str):
             time = {"columns": time}
-        if isinstance(time, Columns) and not isinstance(time, Clock):
-            time = asdict(time)
         self.time: Clock = validated(Clock, "time", time)
         self.q: Columns = validated(Columns, "q", q)
         self.u: Columns = validated(Columns, "u", u or {"columns": [], "unit": []})
