@@ -149,7 +149,7 @@ class LeastSquares:
         earlier = covariance is not None
         growth: list[Windows] = []
         stages = {}
-        if model.input_affine or not self.rollouts:
+        if not self.rollouts or model.input_affine:
             stages[IDENTIFICATION] = partial(self._identify, model, prior, trajectories, earlier)
         if self.rollouts:
             assert windows is not None
