@@ -32,8 +32,8 @@ def main(runs: Path) -> None:
     print(
         f"\n1. Mean error over 5 s of test motions, from {min(pairs):.0f} pairs [rad, m]: "
         f"{errors(runs / 'demo-evaluation')}.\n"
-        "   lnn has no measured momenta, unlike hnn. It needs more steps than the 3000 of this demo: "
-        "with trainer.steps=9000, its errors are below those of mlp here and in 2.\n"
+        "   lnn has no measured momenta, unlike hnn, and needs more steps than the 3000 of this "
+        "demo: with trainer.steps=9000, its errors are below those of mlp here and in 2.\n"
         f"2. On motions a third larger than in training: {errors(runs / 'demo-beyond')}.\n"
         f"3. Control with inputs of at most {peak:.2g} Nm or N: 1 s after a step, the arm is "
         f"{reached['learned']:.2g} % of the step from the set point with learned matrices, "
