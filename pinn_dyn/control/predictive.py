@@ -140,6 +140,8 @@ class PredictiveControl(Controller):
             ValueError: on a time before the previous call, a first state beyond its limits, or a
                 time or reference that is not finite.
         """
+        if not math.isfinite(t):
+            raise ValueError(f"t is {t}, expected the time of the call in s")
         states = torch.cat([q, v], -1).reshape(-1, 2 * self.num_coordinates).double().cpu().numpy()
         if not self._memory:
             self._start(t, states)

@@ -228,9 +228,11 @@ def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
     assert not law(0.0, *broken, goal).any()  # nothing was applied before
 
 
-def test_limits_and_references_that_are_not_numbers_are_named():
+def test_times_limits_and_references_that_are_not_numbers_are_named():
     law = PredictiveControl(Pendulum(), 0.6, STEP)
     state, goal = [double([[0.1]]), double([[0.0]])], SetPoint([1.0])(0.0)
+    with pytest.raises(ValueError, match="t is nan, expected the time of the call in s"):
+        law(np.nan, *state, goal)
     with pytest.raises(ValueError, match=r"the reference of v\[0\] at 0 s is not finite"):
         law(0.0, *state, goal._replace(v=double([np.nan])))
     for name in ("q_low", "v_max", "position_weight"):
