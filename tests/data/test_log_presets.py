@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
+from pinn_dyn.app.build import build_source
+from pinn_dyn.app.config import composed
 from pinn_dyn.app.trust import may_build
 from pinn_dyn.data import draw_windows, logs
 from pinn_dyn.mechanics import stack
@@ -22,9 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def preset(name, *overrides):
-    with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "conf")):
-        config = compose("train", overrides=[f"dataset={name}", *overrides]).dataset
-    return instantiate(OmegaConf.to_container(config, resolve=True), _convert_="all")
+    return build_source(composed("train", [f"dataset={name}", *overrides]))
 
 
 @needs_logs
