@@ -105,6 +105,20 @@ def test_models_of_one_kind_share_the_compiled_code_but_not_its_numbers(cached):
     assert len([*cached.glob("compiled/*")]) == 3  # and the numbers of both
 
 
+def test_new_numbers_of_a_model_count_in_its_next_path():
+    model = make_structured("lnn", **NETWORK).double().requires_grad_(False)
+    copy, t = model_for_rollouts(model), 0.01 * torch.arange(20).double()
+    signal = Signal(t, torch.ones(20, 3).double())
+    x0 = torch.full((6,), 0.1).double()
+    copy.predict(x0, t, signal)
+    for item in (model, copy):
+        for parameter in item.parameters():
+            parameter.mul_(1.1)
+    with torch.no_grad():
+        found, expected = copy.predict(x0, t, signal), model.predict(x0, t, signal)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+
+
 def next_process(monkeypatch, count=80):
     """Roll out in a process that has no loops yet; return its only one."""
     c_loop._LOOPS.clear()
