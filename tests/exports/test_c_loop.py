@@ -110,11 +110,11 @@ def test_new_numbers_of_a_model_count_in_its_next_path():
     copy, t = model_for_rollouts(model), 0.01 * torch.arange(20).double()
     signal = Signal(t, torch.ones(20, 3).double())
     x0 = torch.full((6,), 0.1).double()
-    copy.predict(x0, t, signal)
-    for item in (model, copy):
-        for parameter in item.parameters():
-            parameter.mul_(1.1)
     with torch.no_grad():
+        copy.predict(x0, t, signal)
+        for item in (model, copy):
+            for parameter in item.parameters():
+                parameter.mul_(1.1)
         found, expected = copy.predict(x0, t, signal), model.predict(x0, t, signal)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
