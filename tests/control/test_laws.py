@@ -21,6 +21,7 @@ from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
 from pinn_dyn.testing.controller import states
 from tests.models.builders import InverseOf, make_model, make_structured
 from tests.support.cart_pole import CartPole
+from tests.support.contracts import one_case
 
 MODEL_BASED = [ProportionalDerivative, Regulation, Tracking, ComputedTorque]
 
@@ -222,13 +223,13 @@ def test_a_black_box_has_no_terms_for_a_law(kind):
 @pytest.mark.parametrize(
     ("law", "model"),
     [
-        *((law, CartPole) for law in MODEL_BASED),
-        (Tracking, SoftArm),
+        (ProportionalDerivative, CartPole),
         (Regulation, partial(linear_system, 2, 4)),
         (Tracking, partial(make_structured, "lnn", 2, 4)),
         (ComputedTorque, partial(make_structured, "hnn")),
     ],
 )
+@one_case
 class TestModelBasedLaw(ControllerContract):
     @pytest.fixture
     def controller(self, law, model):

@@ -11,6 +11,7 @@ from pinn_dyn.control.laws import Regulation
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.testing import ControllerContract, LinearSystem
 from pinn_dyn.testing.controller import states
+from tests.support.contracts import one_case
 
 LOGGER = "pinn_dyn.control.region"
 
@@ -132,6 +133,7 @@ def test_one_warning_in_each_run(caplog):
 
 
 @pytest.mark.parametrize("threshold", [0.01, 1.0, 1e3], ids=["outside", "both", "inside"])
+@one_case
 class TestGuarded(ControllerContract):
     @pytest.fixture
     def controller(self, threshold):

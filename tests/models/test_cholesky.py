@@ -16,6 +16,7 @@ from pinn_dyn.models import (
 )
 from pinn_dyn.testing import CholeskyHeadContract, assert_near
 from tests.models.builders import make_scales, perturb, positive_matrix
+from tests.support.contracts import one_case
 
 SIZE = 3
 SCALE = torch.tensor([0.5, 2.0, 3.0], dtype=torch.float64)
@@ -51,12 +52,14 @@ def q():
 
 
 @pytest.mark.parametrize("name", HEADS)
+@one_case
 class TestCholeskyHead(CholeskyHeadContract):
     @pytest.fixture
     def head(self, name):
         return make(HEADS[name])
 
 
+@one_case
 class TestWithAngles(CholeskyHeadContract):
     @pytest.fixture
     def head(self):
@@ -68,6 +71,7 @@ class TestWithAngles(CholeskyHeadContract):
         assert float(head.matrix(1e5 * q).abs().max()) < 2 * largest
 
 
+@one_case
 class TestBeyondTheUnrolled(CholeskyHeadContract):
     """More coordinates are placed by their index; here so few are."""
 

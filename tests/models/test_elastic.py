@@ -16,11 +16,15 @@ from pinn_dyn.models import ElasticJoints, KnownMechanics, Servo
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from pinn_dyn.training import LeastSquares
+from tests.support.contracts import one_case, slow_except
 from tests.support.known import elastic_model
 from tests.support.rigid_chains import joint, link, robot
 
 
-@pytest.mark.parametrize("settings", [{}, {"input": partial(Servo, limit="learned")}])
+@pytest.mark.parametrize(
+    "settings", slow_except([{}, {"input": partial(Servo, limit="learned")}], [{}])
+)
+@one_case
 class TestElasticJoints(MechanicalSystemContract):
     gradient_tolerance = 2e-5  # the force of a servo bends at its limit
 

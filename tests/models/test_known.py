@@ -13,6 +13,7 @@ from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, R
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters
 from pinn_dyn.testing import MechanicalSystemContract
+from tests.support.contracts import one_case
 from tests.support.known import known_model, statistics
 from tests.support.rigid_chains import TREE
 
@@ -25,6 +26,7 @@ def anywhere(module, std=1.0, seed=0):
     return module.double()
 
 
+@one_case
 class TestKnownMechanicsContract(MechanicalSystemContract):
     """With every kind of constant, away from the start."""
 

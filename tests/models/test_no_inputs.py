@@ -10,6 +10,7 @@ from pinn_dyn.models.linear_rival import LinearRival
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.testing import LinearSystem, MechanicalSystemContract
 from tests.models.builders import STEP, make_model, make_statistics, make_structured, random_batch
+from tests.support.contracts import one_case
 from tests.support.rigid_chains import TREE
 
 T = STEP * torch.arange(60, dtype=torch.float64)
@@ -46,12 +47,14 @@ MODELS = {
 }
 
 
+@one_case
 class TestLagrangianNetwork(MechanicalSystemContract):
     @pytest.fixture
     def system(self):
         return make_structured("lnn", 2, 0)
 
 
+@one_case
 class TestKnownMechanics(MechanicalSystemContract):
     @pytest.fixture
     def system(self):

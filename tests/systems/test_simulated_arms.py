@@ -12,6 +12,7 @@ import torch
 
 from pinn_dyn.systems import BulletArm, MujocoArm, RigidChain
 from pinn_dyn.testing.mechanical_system import Configurations, MechanicalSystemContract
+from tests.support.contracts import one_case
 from tests.support.rigid_chains import TREE
 from tests.support.simulated_arms import FINGERS, PANDA, SIMULATORS, simulated_by, states
 from tests.support.urdf_by_hand import SPATIAL, jacobian_of, urdf_frames, urdf_mass_matrix
@@ -33,6 +34,7 @@ def Arm(request):
     return simulated_by(request.param)
 
 
+@one_case
 class TestPanda(MechanicalSystemContract):
     @pytest.fixture
     def system(self, panda):
