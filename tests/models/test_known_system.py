@@ -8,15 +8,8 @@ from pinn_dyn.systems import RigidChain, SoftArm
 from pinn_dyn.testing import MechanicalSystemContract
 from tests.support.cart_pole import CartPole
 from tests.support.contracts import one_case, slow_except
-from tests.support.known import known_arm, known_cart_pole, statistics
+from tests.support.known import anywhere, known_arm, known_cart_pole, statistics
 from tests.support.rigid_chains import TREE
-
-
-def anywhere(model, std, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    for parameter in model.parameters():
-        torch.nn.init.normal_(parameter, std=std, generator=generator)
-    return model
 
 
 @one_case
