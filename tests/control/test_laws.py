@@ -86,8 +86,9 @@ def test_laws_on_the_cart_pole_are_their_formulas(law):
     assert_near(law(CartPole(), [3.0, 5.0], [1.0, 2.0])(0.0, q, v, motion)[:, 0], expected, 1e-12)
 
 
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 2), (1, 3), (3, 1)])
-@pytest.mark.parametrize("batch", [(), (1,), (2,), (2, 3)])
+@pytest.mark.parametrize(
+    ("n", "m", "batch"), [(1, 1, (1,)), (2, 2, ()), (2, 2, (2,)), (1, 3, (2, 3)), (3, 1, (2,))]
+)
 def test_one_force_serves_a_batch_of_any_shape(n, m, batch):
     generator = torch.Generator().manual_seed(0)
     A = torch.randn(*batch, n, m, generator=generator, dtype=torch.float64)

@@ -109,9 +109,11 @@ BAD_RUNS = {
 }
 
 
-@pytest.mark.parametrize(("change", "cause"), BAD_RUNS.values(), ids=BAD_RUNS)
-@pytest.mark.parametrize("run", ["r2", "r3"])  # a training run, and the test run
-def test_a_bad_run_is_named_with_its_cause(arms, run, change, cause):
+@pytest.mark.parametrize("name", BAD_RUNS)
+def test_a_bad_run_is_named_with_its_cause(arms, name):
+    """A training run and the test run in turn."""
+    change, cause = BAD_RUNS[name]
+    run = ("r2", "r3")[list(BAD_RUNS).index(name) % 2]
     texts = measured({**arms, run: change(arms[run])})
     assert any(run in text and cause in text for text in texts)
     assert all(run in text for text in texts)

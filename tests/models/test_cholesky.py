@@ -154,12 +154,11 @@ def test_outputs_far_from_the_data_end_at_the_margin_of_their_kind(q):
     assert (beyond > 0.9 * margin).all()
 
 
-@pytest.mark.parametrize("factor", [0.5, 4.0])
-@pytest.mark.parametrize("name", [name for name in HEADS if name != "fixed"])
-def test_the_scale_is_honoured(name, factor, q):
+def test_the_scale_is_honoured(q):
     """L is proportional to it; a fixed matrix has its own."""
-    scaled = make(lambda _: HEADS[name](scales(value=factor * SCALE)))
-    assert_near(scaled(q), factor * make(HEADS[name])(q), 1e-6)
+    for name in [name for name in HEADS if name != "fixed"]:
+        scaled = make(lambda _, name=name: HEADS[name](scales(value=4.0 * SCALE)))
+        assert_near(scaled(q), 4.0 * make(HEADS[name])(q), 1e-6)
 
 
 @pytest.mark.parametrize(
