@@ -12,6 +12,7 @@ from pinn_dyn.systems import SoftArm
 from reproduce import ENTRIES, read_entries
 from tests.docs.commands import check_python
 
+SLOW = pytest.mark.slow
 Q = {"strongly_bent": [1.2, -0.2, 0.15], "bent": [0.8, 0.2, 0.3]}
 # The matrices that the paper prints.
 LEARNED = {
@@ -69,7 +70,9 @@ def test_the_papers_errors_follow_from_the_matrices_that_it_prints(model, config
         assert float(error) == pytest.approx(expected, abs=0.051), term
 
 
-def test_the_commands_of_the_entries_compose(tmp_path):
+@pytest.mark.parametrize("part", [slice(None, None, 5), pytest.param(slice(None), marks=SLOW)])
+def test_the_commands_of_the_entries_compose(tmp_path, part):
+    """Every fifth of them, all with make test-slow."""
     earlier = set()
     commands = set()
     for name, entry in read_entries().items():
@@ -83,5 +86,5 @@ def test_the_commands_of_the_entries_compose(tmp_path):
         assert set(entry.get("runs", ())) <= earlier, name
         earlier.add(name)
     assert len(commands) > 50
-    for words in sorted(commands):
+    for words in sorted(commands)[part]:
         check_python([*words], tmp_path)
