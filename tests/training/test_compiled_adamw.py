@@ -46,8 +46,8 @@ def trained(model, clipping, compiled, state=None, steps=range(STEPS)):
 @pytest.mark.parametrize(
     ("clipping", "built"),
     [
-        ((None, False), False),
-        ((0.02, True), False),
+        pytest.param((None, False), False, marks=pytest.mark.slow),
+        pytest.param((0.02, True), False, marks=pytest.mark.slow),
         ((0.3, False), False),
         pytest.param((0.3, False), True, marks=pytest.mark.slow),
     ],
