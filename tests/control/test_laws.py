@@ -22,6 +22,7 @@ from pinn_dyn.testing.controller import states
 from tests.models.builders import InverseOf, make_model, make_structured
 from tests.support.cart_pole import CartPole
 from tests.support.contracts import one_case
+from tests.support.linear import double
 
 MODEL_BASED = [ProportionalDerivative, Regulation, Tracking, ComputedTorque]
 
@@ -33,10 +34,6 @@ def linear_system(n, m, seed=0):
         x @ x.T + 0.5 * np.eye(n) for x in (random.normal(size=(n, n)) for _ in range(3))
     )
     return LinearSystem(mass, stiffness, damping, random.normal(size=(n, m)))
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 # Against NumPy.
@@ -72,7 +69,7 @@ def test_proportional_derivative_is_the_feedback_through_the_input_matrix():
 def test_laws_on_the_cart_pole_are_their_formulas(law):
     """By its terms, written by hand; the one input reaches the first coordinate."""
     q, v, motion = states(2)
-    pd = tensor([3.0, 5.0]) * (motion.q - q) + tensor([1.0, 2.0]) * (motion.v - v)
+    pd = double([3.0, 5.0]) * (motion.q - q) + double([1.0, 2.0]) * (motion.v - v)
     zero = torch.zeros_like(q)
     at = {
         Regulation: (q, zero, zero),

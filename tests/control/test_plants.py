@@ -10,11 +10,8 @@ from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem, PlantContract, damped_oscillators, exact_solution
 from tests.support.closed_loops import Vanishing
 from tests.support.contracts import one_case
+from tests.support.linear import double
 from tests.support.simulated_arms import FINGERS, PANDA, SIMULATORS, simulated_by
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def run(plant, q0, v0, inputs, duration):
