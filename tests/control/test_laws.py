@@ -1,6 +1,5 @@
 """Control laws against NumPy, against the closed loop that they promise, and their errors."""
 
-import copy
 from functools import partial
 
 import numpy as np
@@ -15,11 +14,10 @@ from pinn_dyn.control.laws import (
     Tracking,
 )
 from pinn_dyn.mechanics.arrays import pseudo_inverse_times
-from pinn_dyn.models import NetworkCholesky, Positive
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
 from pinn_dyn.testing.controller import states
-from tests.models.builders import InverseOf, make_model, make_structured
+from tests.models.builders import make_model, make_structured
 from tests.support.cart_pole import CartPole
 from tests.support.contracts import one_case
 from tests.support.linear import double
@@ -136,21 +134,6 @@ def test_computed_torque_on_the_truth_gives_the_linear_error_dynamics(system):
     u = ComputedTorque(system, kp, kd.tolist())(0.0, q, v, motion)
     error_acceleration = motion.a - system.forward_dynamics(q, v, u).detach()
     assert_near(error_acceleration, -kd * (motion.v - v) - kp * (motion.q - q), 1e-9)
-
-
-@pytest.mark.parametrize("law", MODEL_BASED)
-def test_hamiltonian_and_lagrangian_network_of_equal_terms_give_equal_inputs(law):
-    lagrangian = make_structured(
-        "lnn", mass=partial(NetworkCholesky, hidden=[6], positivity=Positive(floor=1.0))
-    )
-    mass = copy.deepcopy(lagrangian.mass)
-    hamiltonian = make_structured("hnn", mass=lambda _: InverseOf(mass))
-    mass.load_state_dict(lagrangian.mass.state_dict())
-    for name in ("potential", "damping", "input"):
-        getattr(hamiltonian, name).load_state_dict(getattr(lagrangian, name).state_dict())
-    at = states(3)
-    expected = law(lagrangian, 5.0, 1.0)(0.0, *at)
-    assert_near(law(hamiltonian, 5.0, 1.0)(0.0, *at), expected, 1e-9)
 
 
 # Singular input matrices.
