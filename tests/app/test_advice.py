@@ -83,7 +83,7 @@ VALUES = {
     "longer windows (data.steps)": "data.steps=2",
     "raise optimizer.samples": "optimizer.samples=500",
     "run=...": "run={lnn}",
-    "a run of model=lnn or model=hnn": "run={lnn} or run={hnn}",
+    "a run of model=lnn or model=hnn": "run={lnn}",
     "reference.q=[...]": "reference.q=[0,0,0.2]",
     "leave it out": "~actuator.rate",
     "give a rate": "rate=200",
@@ -128,8 +128,8 @@ def filled(word, folders):
 
 
 @pytest.fixture
-def runs(lnn_run, mlp_run, hnn_run):
-    return {"lnn": lnn_run, "mlp": mlp_run, "hnn": hnn_run}
+def runs(lnn_run, mlp_run):
+    return {"lnn": lnn_run, "mlp": mlp_run}
 
 
 FAST = (
