@@ -43,6 +43,15 @@ def kept_compositions():
         yield patch
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _figures_without_layout():
+    """The places of the axes take as long as all that is drawn in them."""
+    with pytest.MonkeyPatch.context() as patch:
+        engine = "matplotlib.layout_engine.ConstrainedLayoutEngine.execute"
+        patch.setattr(engine, lambda *_: None)
+        yield
+
+
 @pytest.fixture
 def traced(monkeypatch):
     """Programs that are traced and decomposed as ever, but not built: that takes far longer.

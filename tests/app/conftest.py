@@ -26,15 +26,6 @@ def _kept_entry_points():
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _figures_without_layout():
-    """The places of the axes take as long as all that is drawn in them."""
-    with pytest.MonkeyPatch.context() as patch:
-        engine = "matplotlib.layout_engine.ConstrainedLayoutEngine.execute"
-        patch.setattr(engine, lambda *_: None)
-        yield
-
-
 @pytest.fixture(scope="session")
 def hnn_run(tmp_path_factory):
     """A Hamiltonian network, two epochs."""

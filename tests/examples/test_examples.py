@@ -107,6 +107,7 @@ def test_own_robot():
     assert "M learned" in run("own_robot.py", "--steps", "2")
 
 
+@pytest.mark.slow
 def test_lqr():
     """The gains of the true robot balance it, and an untrained model has gains of finite size."""
     assert "K learned" in run("lqr.py", "--steps", "2")

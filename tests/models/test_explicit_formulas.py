@@ -28,8 +28,8 @@ FAST = [name for name in MODELS if not name.split()[1].startswith(ALIKE)]
 
 
 @pytest.mark.parametrize("name", slow_except(MODELS, FAST))
-def test_a_step_and_its_gradients_are_those_of_the_scalar_function(name):
-    """Second derivatives of the heads: the loss is a function of first derivatives."""
+def test_state_derivative_is_that_of_the_scalar_function(name):
+    """So are a step and its gradients, by second derivatives of the heads."""
     kind, variant = MODELS[name]
     model = make_structured(kind, **variant)
     x, u, target = batch_of(model)

@@ -66,6 +66,7 @@ def test_weights_gradients_and_moments_are_those_of_the_optimizer(request, clipp
     assert float(state[0]["state"][0]["step"]) == STEPS
 
 
+@pytest.mark.slow
 def test_steps_go_on_from_a_saved_state_of_the_optimizer(traced):
     model = make_model("lnn")
     whole, _, _ = trained(copy.deepcopy(model), (0.3, False), compiled=True)

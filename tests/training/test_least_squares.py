@@ -95,6 +95,7 @@ def test_the_dynamics_are_found_from_a_generic_start(truth, runs, unseen, rollou
     assert torch.linalg.eigvalsh(result.covariance).min() > 0
 
 
+@pytest.mark.slow
 def test_a_payload_is_found_from_seconds_where_all_else_is_known(truth, runs):
     windows = draw_windows(runs, count=4, steps=1, stride=1, seed=0)
     solver = LeastSquares(cutoff=20.0, rollouts=False)
