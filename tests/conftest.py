@@ -43,6 +43,15 @@ def kept_compositions():
         yield patch
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _figures_without_layout():
+    """The places of the axes take as long as all that is drawn in them."""
+    with pytest.MonkeyPatch.context() as patch:
+        engine = "matplotlib.layout_engine.ConstrainedLayoutEngine.execute"
+        patch.setattr(engine, lambda *_: None)
+        yield
+
+
 @pytest.fixture
 def traced(monkeypatch):
     """Programs that are traced and decomposed as ever, but not built: that takes far longer.
@@ -63,6 +72,7 @@ def undrawn(monkeypatch):
     """No pictures and no pages of the programs: they take longer than all else."""
     monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
     monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
+    monkeypatch.setattr("pinn_dyn.evaluation.log_check.LogCheck.save", lambda *_: "nowhere")
     evaluation = "pinn_dyn.evaluation"
     monkeypatch.setattr(f"{evaluation}.Evaluation.figures", lambda *_: iter(()))
     page = f"{evaluation}.report.prediction_page.prediction_report"

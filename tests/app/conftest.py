@@ -28,9 +28,9 @@ def _kept_entry_points():
 
 @pytest.fixture(scope="session")
 def hnn_run(tmp_path_factory):
-    """A Hamiltonian network, two epochs, with figures."""
+    """A Hamiltonian network, two epochs."""
     folder = tmp_path_factory.mktemp("runs") / "hnn"
-    return train(folder, "model=hnn", "trainer.steps=4", "trainer.validations=2")
+    return train(folder, "model=hnn", "trainer.steps=4", "trainer.validations=2", NO_FIGURES)
 
 
 @pytest.fixture(scope="session")

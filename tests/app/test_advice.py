@@ -6,6 +6,7 @@ import pandas as pd
 import pytest
 
 from tests.app.entry import NO_FIGURES, ROOT, SET_POINTS, TINY, fails, run_script
+from tests.support.contracts import slow_except
 from tests.support.delayed_robots import log
 
 OVERRIDE = re.compile(r"~[\w/.]+|\b[a-z]\w*(?:[./]\w+)*=(?:\[[^]]*\]|[^\s,;:'\"]+)")
@@ -82,7 +83,7 @@ VALUES = {
     "longer windows (data.steps)": "data.steps=2",
     "raise optimizer.samples": "optimizer.samples=500",
     "run=...": "run={lnn}",
-    "a run of model=lnn or model=hnn": "run={lnn} or run={hnn}",
+    "a run of model=lnn or model=hnn": "run={lnn}",
     "reference.q=[...]": "reference.q=[0,0,0.2]",
     "leave it out": "~actuator.rate",
     "give a rate": "rate=200",
@@ -127,16 +128,20 @@ def filled(word, folders):
 
 
 @pytest.fixture
-def runs(lnn_run, mlp_run, hnn_run):
-    return {"lnn": lnn_run, "mlp": mlp_run, "hnn": hnn_run}
+def runs(lnn_run, mlp_run):
+    return {"lnn": lnn_run, "mlp": mlp_run}
 
 
-SLOW = ("too few windows", "gains that let the loop diverge")
-NAMES = [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in COMMANDS]
+FAST = (
+    *("midpoint, no derivative", "least squares of a network", "inputs in ampere"),
+    *("memory without history", "no compiler", "option of a group", "chain of M^-1"),
+    *("a joint without an input", "loss that diverges", "no set point", "rate of an actuator"),
+    *("start outside the limits", "too few periods"),
+)
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_except(COMMANDS, FAST))
 def test_the_suggested_override_works(name, tmp_path, monkeypatch, runs):
     if name == "no compiler":
         monkeypatch.setattr("pinn_dyn.app.trainer.has_cpp_compiler", lambda: False)

@@ -62,11 +62,12 @@ def printed_training(folder, capsys, table, effects, *settings):
     script, *words = shlex.split(command)
     small = ["trainer.steps=1", "trainer.validations=1", "data.pairs=64", "data.batch_size=64"]
     small += ["compile=false"] if "model=lnn" in words else ["optimizer.rollouts=false"]
-    small += ["validator.horizon=0.1", f"hydra.run.dir={folder / 'run'}"]
+    small += ["validator.horizon=0.1", NO_FIGURES, f"hydra.run.dir={folder / 'run'}"]
     run_script(script, *words, *small)
     return load(folder / "run").model
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_printed_training_has_the_friction_of_the_log(tmp_path, capsys):
     item = resting(0.3)
     table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
@@ -75,6 +76,7 @@ def test_the_printed_training_has_the_friction_of_the_log(tmp_path, capsys):
     assert isinstance(model.friction, CoulombFriction)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
     t = np.arange(3000) / 100
     table = {"t": t}
@@ -87,6 +89,7 @@ def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
     assert isinstance(model.input, Servo)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_printed_training_identifies_the_structure_of_the_check(tmp_path, capsys):
     item = resting(0.3)
     table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
@@ -97,6 +100,7 @@ def test_the_printed_training_identifies_the_structure_of_the_check(tmp_path, ca
     assert len(model.structure.joint_names) == 2
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_no_training_is_printed_where_an_angle_turns_too_far_in_a_sample(tmp_path, capsys):
     item = resting(0.3)
     q = 60 * item.q  # up to 370 rad/s at 200 Hz
@@ -154,6 +158,7 @@ def test_the_constants_of_elastic_joints_are_trained_as_printed(tmp_path, capsys
     assert isinstance(model.structure, ElasticJoints)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_remedy_for_a_delay_is_followed(tmp_path, capsys):
     words = [*arguments(tmp_path), "data.pairs=64", "data.batch_size=64", "trainer.steps=1"]
     run_script("check.py", *words[:-3])

@@ -49,9 +49,9 @@ def elsewhere(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory, lnn_run):
-    """Three runs at 200 Hz with an animation."""
+    """Three runs at 200 Hz."""
     folder = tmp_path_factory.mktemp("control")
-    return control(folder, lnn_run, "rate=200", "animate=true", "guard.threshold=1.0")
+    return control(folder, lnn_run, "rate=200", "guard.threshold=1.0")
 
 
 def test_the_table_has_a_row_for_each_controller(results):
@@ -64,11 +64,16 @@ def test_the_table_has_a_row_for_each_controller(results):
     assert coordinates.groupby("controller").size().to_dict() == {"learned": 3, "truth": 3, "pd": 3}
 
 
-def test_figures_animation_record_page_and_provenance_are_written(results, lnn_run):
+@pytest.mark.slow
+def test_an_animation_is_written(tmp_path, lnn_run):
+    control(tmp_path, lnn_run, "rate=200", "animate=true", "~controllers.truth", "~controllers.pd")
+    with Image.open(tmp_path / "animation_learned.gif") as animation:
+        assert animation.is_animated
+
+
+def test_figures_record_page_and_provenance_are_written(results, lnn_run):
     for name in ("closed_loop", "comparison"):
         assert (results / f"{name}.png").stat().st_size > 10_000
-    with Image.open(results / "animation_learned.gif") as animation:
-        assert animation.is_animated
     summary = pd.read_csv(results / "summary.csv")
     with np.load(results / "record_learned.npz") as record:
         assert {"input_condition", "distance", "outside"} <= set(record)
@@ -110,6 +115,7 @@ def test_predictive_control_keeps_the_limits_and_reports_its_solver(tmp_path, ln
         assert {"solve_time", "distance"} <= set(record)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_at_once_has_its_curves_and_its_report(tmp_path, lnn_run):
     words = ["gains.position=1e5", "gains.velocity=1e3", "rate=100", "duration=0.4", "runs=1"]
     words += ["settled_after=0.2", "~controllers.truth", "~controllers.pd"]
@@ -167,6 +173,7 @@ def test_the_guard_of_a_known_robot_counts_whole_turns_as_the_same_angle():
     assert region.distance(q[0, 0] + 2 * torch.pi, train[0].v[0]) < 1e-6
 
 
+@pytest.mark.slow
 def test_the_guard_acts_and_is_exported_with_the_observer(tmp_path, lnn_run, undrawn, few_states):
     """Also if the exported law is not the learned law of the loop."""
     path = tmp_path / "law.c"
@@ -278,6 +285,7 @@ def test_the_panda_is_controlled_without_pybullet(request, tmp_path, experiment,
     assert (folder / "tip_path.png").is_file() == (experiment == "panda/helix")
 
 
+@pytest.mark.slow
 def test_the_panda_is_planned_within_its_limits(tmp_path, panda_run, undrawn):
     pytest.importorskip("casadi")
     words = ["duration=0.1", "runs=2", "controllers.learned.terms=truth", "~controllers.truth"]

@@ -52,6 +52,7 @@ def evaluation_of(run, folder):
     return [f"runs=[{run}]", f"hydra.run.dir={folder}"]
 
 
+@pytest.mark.slow
 def test_the_script_writes_the_example_log_again(tmp_path):
     script = runpy.run_path(str(EXAMPLES / "write_example_log.py"))
     script["main"](tmp_path / "again.csv")
@@ -70,6 +71,7 @@ def test_a_run_on_a_log_keeps_the_report_of_the_cleaning(run):
     assert "## Warnings\n\n- none" in report
 
 
+@pytest.mark.slow
 def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, capsys):
     run_script("evaluate.py", *evaluation_of(run, tmp_path / "out"))
     assert "example_log: 2 unseen test trajectories, 5 s open loop" in capsys.readouterr().out

@@ -12,7 +12,7 @@ import pinn_dyn
 from pinn_dyn.models import KnownMechanics
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares
-from tests.app.entry import refused_text, run_script
+from tests.app.entry import NO_FIGURES, refused_text, run_script
 
 ROD = """<robot name="pendulum"><link name="base"/>
   <link name="rod"><inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
@@ -57,12 +57,13 @@ test: {{runs: 2, piece: 1.0}}
     return ["--config-dir", str(tmp_path / "conf"), "dataset=swings"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_log_without_inputs_is_checked_trained_and_evaluated(dataset, tmp_path, capsys):
     run_script("check.py", *dataset, f"hydra.run.dir={tmp_path / 'check'}")
     text = capsys.readouterr().out
     assert "a training makes sense" in text
     small = ["model=lnn", "trainer.steps=2", "trainer.validations=1", "data.pairs=64"]
-    small += ["data.batch_size=32", "data.stride=1", "validator.horizon=0.5"]
+    small += ["data.batch_size=32", "data.stride=1", "validator.horizon=0.5", NO_FIGURES]
     run_script("train.py", *dataset, *small, f"hydra.run.dir={tmp_path / 'run'}")
     run = pinn_dyn.load(tmp_path / "run")
     assert run.terms([0.3]).A.shape == (1, 0)

@@ -53,7 +53,7 @@ def test_a_training_and_its_evaluation_log_their_progress(quick, tmp_path, capsy
         assert part in text
         assert part in shown
     caplog.set_level(logging.INFO)
-    pinn_dyn.evaluate(pinn_dyn.load(run))
+    pinn_dyn.evaluate(pinn_dyn.load(run), horizon=0.1, windows=[])
     assert "evaluation: 0 of 5 models, now " in caplog.text
 
 

@@ -7,7 +7,6 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 import pinn_dyn
 from pinn_dyn.app.config import ConfigError
@@ -69,22 +68,6 @@ def test_all_extras_that_the_package_names_exist():
     names = {x for text in texts for x in re.findall(r"pinn_dyn\[(\w+)\]", text)}
     assert names >= {"logs", "mujoco", "panda"}
     assert names <= set(EXTRAS)
-
-
-def test_the_call_of_torch_that_a_message_names_writes_a_log_that_loads(tmp_path):
-    path = tmp_path / "run.pt"
-    t = torch.arange(600) * 0.01
-    q, u = torch.sin(3 * t), torch.cos(t)
-    torch.save(pd.DataFrame({"t": t, "q": q, "u": u}), path)
-    part = {"seconds": 1.0, "piece": 0.5}
-    log = {"time": {"columns": "t", "unit": "s"}, "validation": part, "test": part}
-    log |= {"q": {"columns": ["q"], "unit": "rad"}, "u": {"columns": ["u"], "unit": "Nm"}}
-    source = LogSource(name="arm", root=str(tmp_path), files=path.name, **log)
-    with pytest.raises(LogError, match="save plain tensors") as error:
-        source.load()
-    call = re.search(r"as in (torch.save\(.*\))", str(error.value))[1]
-    eval(call, {"torch": torch, "t": t, "q": q, "u": u, "path": path})
-    assert LogSource(name="arm", root=str(tmp_path), files=path.name, **log).load().train
 
 
 def test_the_command_for_a_xacro_file_makes_a_robot_that_loads(tmp_path, monkeypatch):

@@ -131,6 +131,7 @@ def test_a_sweep_writes_a_folder_per_combination(tmp_path):
 
 
 def test_a_step_too_long_for_the_fastest_motion_is_named(tmp_path, capsys):
-    run_script("train.py", *TINY, "dataset.step=0.05", "data.stride=1", f"hydra.run.dir={tmp_path}")
+    words = ["dataset.step=0.05", "data.stride=1", NO_FIGURES, f"hydra.run.dir={tmp_path}"]
+    run_script("train.py", *TINY, *words)
     text = capsys.readouterr().out
     assert "a step of 0.05 s is too long for the fastest motion in the data, that of" in text

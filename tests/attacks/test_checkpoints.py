@@ -79,9 +79,9 @@ def test_a_damaged_checkpoint_is_refused_by_name(run, change, expected):
     assert str(path) in str(caught.value)
 
 
-def test_weights_of_another_model_are_refused(run, hnn_run):
+def test_weights_of_another_model_are_refused(run, mlp_run):
     path = run / "checkpoints" / "best.ckpt"
-    other = torch.load(hnn_run / "checkpoints" / "best.ckpt", weights_only=True)
+    other = torch.load(mlp_run / "checkpoints" / "best.ckpt", weights_only=True)
     edit(lambda saved: saved.update(state_dict=other["state_dict"]))(path)
     with pytest.raises(ConfigError, match=r"best.ckpt.*: weights of another model: .*Lagrangian"):
         load_run(run)

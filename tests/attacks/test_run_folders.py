@@ -8,7 +8,6 @@ from tests.attacks.targets import calls
 from tests.support.foreign_runs import foreign
 
 MARK = "was_here"
-CALLS = range(len(calls("")))
 
 
 def at_the_top(config, part):
@@ -34,20 +33,27 @@ def beside_all_others(config, part):
 PLACES = [at_the_top, as_an_argument, in_a_list, in_a_model, beside_all_others]
 
 
-@pytest.mark.parametrize("index", CALLS, ids=[str(name) for name, _ in calls("")])
-def test_nothing_foreign_is_run(tmp_path, lnn_run, index):
-    """At one place of five in turn, so that every place sees a sixth of the tricks."""
+@pytest.mark.parametrize("place", range(len(PLACES)), ids=[place.__name__ for place in PLACES])
+def test_nothing_foreign_is_run(tmp_path, lnn_run, place):
+    """Each place sees a fifth of the tricks."""
     mark = tmp_path / MARK
-    target, arguments = calls(str(mark))[index]
-    place = PLACES[index % len(PLACES)]
-    run = foreign(lnn_run, tmp_path / "run", lambda c: place(c, {"_target_": target, **arguments}))
-    with pytest.raises(ConfigError, match=r"may name the classes of pinn_dyn|an expression|_args_"):
-        load_run(run, "best")
-    assert not mark.exists()
+    for number, (target, arguments) in enumerate(calls(str(mark))[place :: len(PLACES)]):
+        part = {"_target_": target, **arguments}
+        run = foreign(lnn_run, tmp_path / f"{number}", lambda c, x=part: PLACES[place](c, x))
+        message = r"may name the classes of pinn_dyn|an expression|_args_"
+        with pytest.raises(ConfigError, match=message):
+            load_run(run, "best")
+        assert not mark.exists(), target
 
 
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("key", ["_args_", "_recursive_", "_convert_", "_call_", "__class__", 3])
+@pytest.mark.parametrize(
+    ("place", "key"),
+    zip(
+        [*PLACES, at_the_top],
+        ["_args_", "_recursive_", "_convert_", "_call_", "__class__", 3],
+        strict=True,
+    ),
+)
 def test_other_keys_of_hydra_are_refused(tmp_path, lnn_run, place, key):
     part = {"_target_": "pinn_dyn.systems.SoftArm", key: ["os.system"]}
     run = foreign(lnn_run, tmp_path / "run", lambda config: place(config, part))

@@ -5,10 +5,7 @@ import pytest
 import torch
 
 from pinn_dyn.control.effects import Actuator, Sensor
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
+from tests.support.linear import double
 
 
 def test_inputs_are_cut_to_their_limits_and_the_cut_ones_are_marked():

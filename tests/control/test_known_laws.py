@@ -7,6 +7,7 @@ from torch import nn
 from pinn_dyn.control.laws import ComputedTorque, ProportionalDerivative, Regulation, Tracking
 from pinn_dyn.testing import ControllerContract, assert_near
 from pinn_dyn.testing.controller import states
+from tests.support.contracts import one_case
 from tests.support.known import known_model
 
 LAWS = [ProportionalDerivative, Regulation, Tracking, ComputedTorque]
@@ -26,10 +27,11 @@ def law_on_known(law):
     return law(model_of_currents(), KP.tolist(), KD.tolist())
 
 
+@one_case
 class TestLawsOnKnownMechanics(ControllerContract):
-    @pytest.fixture(params=LAWS, ids=lambda law: law.__name__)
-    def controller(self, request):
-        return law_on_known(request.param)
+    @pytest.fixture
+    def controller(self):
+        return law_on_known(ComputedTorque)
 
 
 def force(model, q, v, a):

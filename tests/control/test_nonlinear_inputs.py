@@ -26,6 +26,7 @@ from pinn_dyn.systems import SoftArm, TendonArm
 from pinn_dyn.testing import ControllerContract, assert_near
 from pinn_dyn.testing.finite_differences import partial_derivatives
 from tests.models.builders import NONLINEAR, make_structured
+from tests.support.contracts import one_case
 
 ARMS = {"square": TendonArm, "four-tendons": partial(TendonArm, tendons=4)}
 
@@ -234,6 +235,7 @@ def test_the_observer_and_the_proposition_refuse_it_by_name():
         certify(arm, SoftArm(), torch.zeros(1, 3), 1.0, 1.0)
 
 
+@one_case
 class TestLawOnServos(ControllerContract):
     @pytest.fixture
     def controller(self):

@@ -17,15 +17,11 @@ from pinn_dyn.control.references import SetPoint, Sines
 from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
 from pinn_dyn.testing.controller import states
 from tests.support.cart_pole import CartPole
-from tests.support.linear import unit_masses
+from tests.support.linear import double, unit_masses
 
 ZERO = np.zeros((2, 2))
 MASS = np.array([[2.0, 0.5], [0.5, 1.0]])
 INPUTS = np.array([[1.0, 0.3], [-0.2, 0.8]])
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def free_masses(factor=1.0):
@@ -38,7 +34,7 @@ class PushedCartPole(CartPole):
 
     def __init__(self, push):
         super().__init__()
-        self.push = nn.Parameter(tensor(push))
+        self.push = nn.Parameter(double(push))
 
     def potential_energy(self, q):
         return super().potential_energy(q) - (q * self.push).sum(-1)
@@ -66,21 +62,21 @@ class ExactPlant(Plant):
 
 def run(plant, law, reference, *, duration, rate, q0=None, **effects):
     start = reference(0.0)
-    q0 = start.q if q0 is None else tensor(q0)
+    q0 = start.q if q0 is None else double(q0)
     q0, v0 = q0.expand(1, -1).clone(), start.v.expand(1, -1).clone()
     return close_loop(plant, law, reference, q0, v0, duration=duration, rate=rate, **effects)
 
 
 def residuals(observer, plant, period, steps, push=(0.0, 0.0)):
     """Free masses under the observer's input, moved exactly; r after each call, ``(steps, 2)``."""
-    inverse = torch.linalg.inv(tensor(MASS))
-    goal = Motion(tensor([0.3, -0.2]), *torch.zeros(2, 2, dtype=torch.float64))
+    inverse = torch.linalg.inv(double(MASS))
+    goal = Motion(double([0.3, -0.2]), *torch.zeros(2, 2, dtype=torch.float64))
     q, v = torch.zeros(2, 2, dtype=torch.float64)
     found = []
     for k in range(steps):
         u = observer(k * period, q, v, goal)
         found.append(observer.residual)
-        a = inverse @ (tensor(INPUTS) @ u + tensor(push))
+        a = inverse @ (double(INPUTS) @ u + double(push))
         q, v = q + period * v + 0.5 * period**2 * a, v + period * a
     return torch.stack(found)
 
@@ -93,7 +89,7 @@ def test_the_residual_goes_to_a_constant_disturbance_with_time_constant_one_over
     observer = DisturbanceObserver(Regulation(system, 3.0, 2.0), bandwidth)
     found = residuals(observer, system, period, 60, push)
     t = period * torch.arange(60, dtype=torch.float64)
-    assert_near(found, (1 - torch.exp(-bandwidth * t))[:, None] * tensor(push), 1e-10)
+    assert_near(found, (1 - torch.exp(-bandwidth * t))[:, None] * double(push), 1e-10)
 
 
 def test_the_input_is_that_of_the_law_less_what_undoes_the_residual():
@@ -126,7 +122,7 @@ def test_the_input_of_a_period_acts_by_the_mean_of_both_input_matrices():
     u = observer(0.0, q[0], v[0], goal)
     observer(period, q[1], v[1], goal)
     turned = 0.5 * (torch.cos(q[0, 0]) + torch.cos(q[1, 0]))
-    disturbance = tensor(MASS) @ (v[1] - v[0]) / period - turned * tensor(INPUTS) @ u
+    disturbance = double(MASS) @ (v[1] - v[0]) / period - turned * double(INPUTS) @ u
     assert_near(observer.residual, (1 - np.exp(-bandwidth * period)) * disturbance, 1e-10)
 
 
@@ -138,10 +134,10 @@ def test_on_a_nonlinear_system_the_residual_is_the_force_that_the_model_misses()
     for rate in (50.0, 100.0):
         observer = DisturbanceObserver(Regulation(CartPole(), 8.0, 1.0), bandwidth)
         reference = SetPoint([0.3, 0.4])
-        q0 = tensor([[-0.4, 1.2]] * 2)
+        q0 = double([[-0.4, 1.2]] * 2)
         record = close_loop(plant, observer, reference, q0, 0 * q0, duration=0.6, rate=rate)
         assert record.v.abs().amax((1, 2)).min() > 2
-        expected = (1 - np.exp(-bandwidth * 0.6)) * tensor(pushes)
+        expected = (1 - np.exp(-bandwidth * 0.6)) * double(pushes)
         errors.append((observer.residual - expected).abs().amax(-1))
     assert (errors[0] < 5e-3).all()
     assert (errors[1] < errors[0] / 3).all()
@@ -205,7 +201,7 @@ def test_the_limited_rate_bounds_what_would_grow():
     assert (found[1:] - found[:-1]).abs().max() == pytest.approx(0.05)
     assert_near(found[:14, 0], 0.05 * torch.arange(14, dtype=torch.float64), 1e-12)
     # M_L dv/dt = A u_law + d_L with d_L = 2.2 d - 1.2 r is at rest at r = d.
-    assert (found[50:] - tensor([0.7, -1.3])).abs().max() < 0.06
+    assert (found[50:] - double([0.7, -1.3])).abs().max() < 0.06
 
 
 # The contract, memory and errors.

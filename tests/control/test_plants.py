@@ -9,11 +9,9 @@ from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem, PlantContract, damped_oscillators, exact_solution
 from tests.support.closed_loops import Vanishing
+from tests.support.contracts import one_case
+from tests.support.linear import double
 from tests.support.simulated_arms import FINGERS, PANDA, SIMULATORS, simulated_by
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def run(plant, q0, v0, inputs, duration):
@@ -120,12 +118,14 @@ def test_a_simulator_refuses_a_time_between_its_steps(panda):
         assert states.isfinite().all()
 
 
+@one_case
 class TestSystemPlant(PlantContract):
     @pytest.fixture(params=[damped_oscillators, SoftArm], ids=["oscillators", "soft arm"])
     def plant(self, request):
         return SystemPlant(request.param())
 
 
+@one_case
 class TestSimulatorPlant(PlantContract):
     @pytest.fixture
     def plant(self, panda):

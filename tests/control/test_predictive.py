@@ -18,13 +18,10 @@ from pinn_dyn.control import (
 )
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.testing.linear_system import damped_oscillators
+from tests.support.linear import double
 
 pytest.importorskip("casadi")
 STEP = 0.05
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 class Pendulum(MechanicalSystem):

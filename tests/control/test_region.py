@@ -11,12 +11,10 @@ from pinn_dyn.control.laws import Regulation
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.testing import ControllerContract, LinearSystem
 from pinn_dyn.testing.controller import states
+from tests.support.contracts import one_case
+from tests.support.linear import double
 
 LOGGER = "pinn_dyn.control.region"
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def comb(count=50):
@@ -45,8 +43,8 @@ def loops(count, seed, size=2):
 
 def test_the_distance_on_a_line_is_that_of_the_nearest_point_in_units_of_the_spacing():
     region = DataRegion(*comb())
-    q = tensor([[0.0], [50.25], [60.5], [99.0], [102.0], [-7.5]])
-    expected = tensor([0.0, 0.25, 0.5, 0.0, 3.0, 7.5])
+    q = double([[0.0], [50.25], [60.5], [99.0], [102.0], [-7.5]])
+    expected = double([0.0, 0.25, 0.5, 0.0, 3.0, 7.5])
     assert region.distance(q, 0 * q) == pytest.approx(expected, abs=1e-12)
     assert region.distance(q[4], q[4] * 0).shape == ()
     assert float(region.distance(q[4], q[4] * 0)) == pytest.approx(3.0)
@@ -54,11 +52,11 @@ def test_the_distance_on_a_line_is_that_of_the_nearest_point_in_units_of_the_spa
 
 def test_the_distance_is_euclidean_in_standard_deviations():
     """q and v alternate between -1 and 1, and -10 and 10: standard deviations 1 and 10."""
-    q = [tensor([[-1.0], [1.0]]), tensor([[-1.0], [1.0]])]
-    v = [tensor([[-10.0], [-10.0]]), tensor([[10.0], [10.0]])]
+    q = [double([[-1.0], [1.0]]), double([[-1.0], [1.0]])]
+    v = [double([[-10.0], [-10.0]]), double([[10.0], [10.0]])]
     region = DataRegion(q, v)
     assert region.radius == pytest.approx(2.0)  # from v = -10 to v = 10 at the same q
-    distance = region.distance(tensor([1.0 + 3.0]), tensor([10.0 + 40.0]))
+    distance = region.distance(double([1.0 + 3.0]), double([10.0 + 40.0]))
     assert float(distance) == pytest.approx(np.hypot(3.0, 4.0) / 2)
 
 
@@ -80,12 +78,12 @@ def test_one_trajectory_is_cut_into_ten():
     """
     q = torch.arange(1000, dtype=torch.float64)[:, None]
     region = DataRegion([q], [0 * q])
-    assert float(region.distance(tensor([-95.01]), tensor([0.0]))) == pytest.approx(1)
+    assert float(region.distance(double([-95.01]), double([0.0]))) == pytest.approx(1)
 
 
 def test_an_angle_may_wind_and_another_coordinate_may_not():
     q, v = loops(10, seed=1)
-    turn = tensor([2 * np.pi, 0.0])
+    turn = double([2 * np.pi, 0.0])
     region = DataRegion(q, v, angles=[0])
     inside = region.distance(q[:, ::50], v[:, ::50])
     assert region.distance(q[:, ::50] + 3 * turn, v[:, ::50]) == pytest.approx(inside, abs=1e-9)
@@ -103,7 +101,7 @@ def guard(threshold=2.0):
     return Guarded(Regulation(spring(), 3.0, 1.0), DataRegion(*comb()), threshold=threshold)
 
 
-MIXED = tensor([[10.0], [103.5], [100.5], [-9.0]])  # distances 0, 4.5, 1.5 and 9
+MIXED = double([[10.0], [103.5], [100.5], [-9.0]])  # distances 0, 4.5, 1.5 and 9
 REST = Motion(*(torch.zeros(1, dtype=torch.float64) for _ in range(3)))
 
 
@@ -112,7 +110,7 @@ def test_the_law_is_unchanged_and_the_distance_recorded():
     u = guarded(0.5, MIXED, 0 * MIXED, REST)
     assert u == pytest.approx(0.5 * MIXED - 12 * MIXED, rel=1e-12)  # 2 q / 4 - 4 * 3 q, by hand
     found = guarded.diagnostics()
-    assert found["distance"] == pytest.approx(tensor([0.0, 4.5, 1.5, 9.0]))
+    assert found["distance"] == pytest.approx(double([0.0, 4.5, 1.5, 9.0]))
     assert found["outside"].tolist() == [0, 1, 0, 1]
     assert found["input_condition"].tolist() == [1, 1, 1, 1]
 
@@ -132,6 +130,7 @@ def test_one_warning_in_each_run(caplog):
 
 
 @pytest.mark.parametrize("threshold", [0.01, 1.0, 1e3], ids=["outside", "both", "inside"])
+@one_case
 class TestGuarded(ControllerContract):
     @pytest.fixture
     def controller(self, threshold):

@@ -14,13 +14,10 @@ from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem
 from tests.support.cart_pole import CartPole
+from tests.support.linear import double
 
 P = torch.tensor([[2.0, 0.3], [-0.1, 1.5]], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)
-
-
-def tensor(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def draw(seed, *shape, scale=0.5):
@@ -35,7 +32,7 @@ class Arm(MechanicalSystem):
         super().__init__(2, 2)
         self.weight, self.tilt = weight, tilt
         self.register_buffer("left", left)
-        self.register_buffer("extra", tensor(extra))
+        self.register_buffer("extra", double(extra))
         self.register_buffer("turn", left if turn is None else turn)
 
     def mass_matrix(self, q):
@@ -94,7 +91,7 @@ def test_a_model_that_is_a_factor_times_the_truth_leaves_no_force_and_no_error()
 
 @pytest.mark.parametrize("factor", [P, EYE, 0.01 * EYE])
 def test_a_constant_error_of_the_force_gives_the_closed_form(factor):
-    q, extra, K_P = draw(1, 5, 2), tensor([0.2, -0.1]), tensor([3.0, 8.0])
+    q, extra, K_P = draw(1, 5, 2), double([0.2, -0.1]), double([3.0, 8.0])
     model, truth = Arm(left=factor, extra=(0.2, -0.1)), Arm()
     table = certify(model, truth, q, K_P, 2.0)
     # A A_L^-1 (P G + extra) - G = P^-1 extra, and A A_L^T = A A^T P^T.
@@ -124,13 +121,13 @@ def test_the_neumann_bound_is_sharp_for_one_coordinate():
     # A = 1, A_L = 0.6, P = 1: |X Delta_A X| / (1 - |X Delta_A|) = 0.4 / 0.6 = 1 / 0.6 - 1.
     one = LinearSystem([[1.0]], [[2.0]], [[0.1]], [[1.0]])
     learned = LinearSystem([[1.0]], [[2.0]], [[0.1]], [[0.6]])
-    q = tensor([[0.7]])
-    bounds = factor_bounds(tensor([[[1.0]]]), one.terms(q), learned.terms(q))
+    q = double([[0.7]])
+    bounds = factor_bounds(double([[[1.0]]]), one.terms(q), learned.terms(q))
     assert bounds["condition_2"].item() == pytest.approx(0.4)
     assert bounds["delta_I_bound"].item() == pytest.approx(2 / 3)
     assert bounds["delta_I"].item() == pytest.approx(2 / 3)
     far = LinearSystem([[1.0]], [[2.0]], [[0.1]], [[-0.6]])
-    bounds = factor_bounds(tensor([[[1.0]]]), one.terms(q), far.terms(q))
+    bounds = factor_bounds(double([[[1.0]]]), one.terms(q), far.terms(q))
     assert bounds["condition_2"].item() == pytest.approx(1.6)
     assert bounds["delta_I_bound"].item() == math.inf
 
@@ -153,10 +150,10 @@ def test_an_input_matrix_of_the_wrong_sign_fails_condition_1_and_says_so():
 
 def test_gains_that_differ_can_break_the_product_that_the_proof_relies_on():
     # sym([[1, .9], [.9, 1]] diag(1, 100)) has the determinant 100 - 45.45^2 < 0.
-    factor = tensor([[1.0, 0.9], [0.9, 1.0]])
+    factor = double([[1.0, 0.9], [0.9, 1.0]])
     truth = LinearSystem(EYE, EYE, EYE, EYE)
     model = LinearSystem(EYE, EYE, EYE, factor)
-    (row,) = certify(model, truth, tensor([[0.1, 0.2]]), [1.0, 100.0], 1.0).itertuples()
+    (row,) = certify(model, truth, double([[0.1, 0.2]]), [1.0, 100.0], 1.0).itertuples()
     assert row.condition_1 == pytest.approx(0.1)
     assert row.velocity_eigenvalue == pytest.approx(0.1)
     assert row.position_eigenvalue == pytest.approx(50.5 - math.sqrt(49.5**2 + 45.45**2))
@@ -164,7 +161,7 @@ def test_gains_that_differ_can_break_the_product_that_the_proof_relies_on():
 
 def test_the_predicted_steady_state_is_where_a_simulation_comes_to_rest():
     truth, model = Arm(), Arm(3.6, 0.6, left=P)
-    q_ref, K_P, K_D = tensor([[0.3, -0.4]]), tensor([5.0, 8.0]), tensor([4.0, 3.0])
+    q_ref, K_P, K_D = double([[0.3, -0.4]]), double([5.0, 8.0]), double([4.0, 3.0])
     (state,) = predict_steady_state(model, truth, q_ref, K_P, K_D).itertuples()
     slope = closed_loop(model, truth, q_ref[0], K_P, K_D)
     end = solve_ivp(slope, (0, 12), np.zeros(4), "LSODA", rtol=1e-5, atol=1e-8).y[:, -1]
@@ -208,7 +205,7 @@ def test_a_slope_above_one_gives_no_bound():
     # One coordinate, A = A_L = 1, G_L - G = 3 q - 1: h = (3 q - 1) / K_P has the slope 3 / K_P.
     truth = LinearSystem([[1.0]], [[2.0]], [[0.1]], [[1.0]])
     model = LinearSystem([[1.0]], [[5.0]], [[0.1]], [[1.0]])
-    q_ref = tensor([[0.4]])
+    q_ref = double([[0.4]])
     weak = predict_steady_state(model, truth, q_ref, 2.0, 1.0)
     assert weak["slope"].item() == pytest.approx(1.5)
     assert weak["bound"].item() == math.inf
@@ -238,7 +235,7 @@ def test_the_report_counts_measured_errors_above_the_bound():
     prediction = predict_steady_state(model, truth, q_ref, 5.0, 3.0)
     measured = torch.tensor(prediction["error"].to_numpy())
     measured[1], measured[2] = 2 * prediction["bound"][1], math.nan
-    text = stability_report("Stability", table, prediction, measured, {0.01: tensor([3.0, 7.0])})
+    text = stability_report("Stability", table, prediction, measured, {0.01: double([3.0, 7.0])})
     assert "| measured above the bound | 1 of 3 |" in text
     assert "| 0.01 | 3 | 7 |" in text
 

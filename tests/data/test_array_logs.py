@@ -120,8 +120,19 @@ def test_a_star_stands_for_the_run_in_names_without_groups(tmp_path):
     assert {part.raw.run for part in log.cleaned} == {"0", "1", "2"}
 
 
-@pytest.mark.parametrize("kind", ["npz", "h5", "mat", "pt"])
-@pytest.mark.parametrize("form", [stacked, shared_clock, time_first, numbered])
+@pytest.mark.parametrize(
+    ("kind", "form"),
+    [
+        ("npz", stacked),
+        ("npz", numbered),
+        ("h5", shared_clock),
+        ("h5", time_first),
+        ("mat", time_first),
+        ("mat", numbered),
+        ("pt", stacked),
+        ("pt", shared_clock),
+    ],
+)
 def test_arrays_of_several_runs(tmp_path, kind, form):
     tables = [motion(6.0, phase=k) for k in range(3)]
     runs = [

@@ -14,7 +14,6 @@ from pinn_dyn.data.logs import (
     RemoveJumps,
     Resample,
     RowClock,
-    SplitGaps,
 )
 from pinn_dyn.data.logs.checks import _are_ticks
 from tests.data.logs_files import motion, source, write
@@ -137,16 +136,6 @@ def test_zeros_before_the_first_sample_are_left_out(tmp_path, count, named):
     assert len(log.load().train[0].t) == 601 - count
     assert any(f"q jumps after the first {count} rows" in x for x in log.warnings) == named
     assert len(log.warnings) == named
-
-
-def test_the_named_step_is_the_cure(tmp_path):
-    write(tmp_path, clock(repeat))
-    steps = {"deduplicate": Deduplicate(), **RESAMPLE}
-    assert len(source(tmp_path, steps=steps).load().train[0].t) == 601
-    write(tmp_path, clock(lambda t: np.where(t > 3, t + 1, t)))
-    assert len(source(tmp_path, steps={"gaps": SplitGaps(longest=0.05)}).load().train) == 2
-    write(tmp_path, clock(lambda t: t + 0.004 * np.sin(40 * t)))
-    assert source(tmp_path, steps=RESAMPLE).load().train[0].t.diff().std() < 1e-12
 
 
 def gaps(rng, bursts):

@@ -7,8 +7,10 @@ import torch
 
 from pinn_dyn.data.logs import LogSource
 from pinn_dyn.systems import RigidChain
+from tests.support import underactuated
 from tests.support.delayed_robots import arm_torque, sines, tendons
 from tests.support.random_chains import random_chain
+from tests.support.underactuated import ACROBOT, PENDUBOT
 
 T = np.arange(801) / 100
 
@@ -107,9 +109,11 @@ BAD_RUNS = {
 }
 
 
-@pytest.mark.parametrize(("change", "cause"), BAD_RUNS.values(), ids=BAD_RUNS)
-@pytest.mark.parametrize("run", ["r2", "r3"])  # a training run, and the test run
-def test_a_bad_run_is_named_with_its_cause(arms, run, change, cause):
+@pytest.mark.parametrize("name", BAD_RUNS)
+def test_a_bad_run_is_named_with_its_cause(arms, name):
+    """A training run and the test run in turn."""
+    change, cause = BAD_RUNS[name]
+    run = ("r2", "r3")[list(BAD_RUNS).index(name) % 2]
     texts = measured({**arms, run: change(arms[run])})
     assert any(run in text and cause in text for text in texts)
     assert all(run in text for text in texts)
@@ -188,28 +192,9 @@ def test_signs_of_an_arm_under_a_controller(gravity):
         assert pushed_backwards(runs, names) == names
 
 
-def underactuated(joint):
-    """Motions of the two rods that one motor drives, by its torque on this joint."""
-    signal = sines(np.random.default_rng(joint), 5, size=4.0 if joint == 0 else 1.0)
-    q, v, zero, rows = np.zeros((5, 2)), np.zeros((5, 2)), np.zeros((5, 2)), []
-    for k in range(5 * len(T)):
-        if k % 5 == 0:  # 100 Hz
-            u = signal(k / 500)
-            rows.append(np.hstack([q, v, u[:, None]]))
-        bias, rest = arm_torque(q, v, zero), arm_torque(q, zero, zero)
-        mass = np.stack([arm_torque(q, zero, zero + e) - rest for e in np.eye(2)], axis=2)
-        v = (
-            v
-            + 0.002
-            * np.linalg.solve(mass, (u[:, None] * np.eye(2)[joint] - bias)[..., None])[..., 0]
-        )
-        q = q + 0.002 * v
-    x = np.stack(rows, axis=1)
-    return {f"r{k}": frame(*np.split(x[k], [2, 4], axis=1)) for k in range(5)}
-
-
-@pytest.mark.parametrize("joint", [0, 1])
-def test_sign_of_an_underactuated_robot(joint):
-    runs = underactuated(joint)
+@pytest.mark.parametrize("robot", [PENDUBOT, ACROBOT], ids=["pendubot", "acrobot"])
+def test_sign_of_an_underactuated_robot(robot):
+    frames = underactuated.log(robot, 5).rename(columns={"u": "u1"}).groupby("run")
+    runs = {f"r{k}": frame.drop(columns="run") for k, (_, frame) in enumerate(frames)}
     assert measured(runs) == []
     assert pushed_backwards(runs, ["u1"]) == ["u1"]

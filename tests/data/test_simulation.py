@@ -6,9 +6,9 @@ import torch
 from scipy.integrate import cumulative_simpson, solve_ivp
 
 from pinn_dyn.data import Mixture, MultiSine, SimulationError, Steps, simulate
-from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import damped_oscillators
+from tests.support.closed_loops import Vanishing
 from tests.support.linear import exact_solution_under_sine
 
 ARM_INPUTS = Mixture(
@@ -114,26 +114,6 @@ def test_the_energy_of_the_soft_arm_changes_by_the_power_that_enters_and_is_lost
     assert np.abs(change).max() > 0.05
 
 
-class LosesMass(MechanicalSystem):
-    """A point mass m(q) under a force of 1 N, with m(q) no longer positive beyond q = 1."""
-
-    def __init__(self, mass):
-        super().__init__(1, 1)
-        self.mass = mass
-
-    def mass_matrix(self, q):
-        return self.mass(q).unsqueeze(-1)
-
-    def potential_energy(self, q):
-        return torch.zeros_like(q[..., 0])
-
-    def damping_matrix(self, q):
-        return torch.zeros_like(q).unsqueeze(-1)
-
-    def input_matrix(self, q):
-        return torch.ones_like(q).unsqueeze(-1)
-
-
 def vanishing(q):
     return 1 - q
 
@@ -144,7 +124,7 @@ def jumping(q):
 
 def push(mass, q0):
     t = np.linspace(0, 5, 51)
-    simulate(LosesMass(mass), np.full((1, 1), q0), np.zeros((1, 1)), constant([1.0], 1), t)
+    simulate(Vanishing(mass), np.full((1, 1), q0), np.zeros((1, 1)), constant([1.0], 1), t)
 
 
 def time_of(error):
@@ -195,7 +175,7 @@ def test_a_motion_that_leaves_its_limits_is_held_and_the_others_go_on(linear):
 def test_a_motion_that_would_lose_its_mass_is_held_before_it_does():
     """Without limits this one ends the simulation of all."""
     q, _ = simulate(
-        LosesMass(vanishing),
+        Vanishing(vanishing),
         np.zeros((2, 1)),
         np.array([[0.0], [-3.0]]),
         constant([1.0], 2),

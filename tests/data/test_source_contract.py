@@ -21,9 +21,11 @@ from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import MujocoArm, SoftArm
 from pinn_dyn.testing import DataSourceContract
 from tests.data.logs_files import motion, source, write
+from tests.support.contracts import one_case
 from tests.support.urdf_by_hand import SPATIAL
 
 
+@one_case
 class TestSimulatedSource(DataSourceContract):
     @pytest.fixture(scope="class")
     def cache(self, tmp_path_factory):
@@ -64,6 +66,7 @@ class TestSimulatedSource(DataSourceContract):
         return self.make(cache, keep_every=2)
 
 
+@one_case
 class TestRobotSource(DataSourceContract):
     @pytest.fixture(scope="class")
     def cache(self, tmp_path_factory):
@@ -99,6 +102,7 @@ class TestRobotSource(DataSourceContract):
         return self.make(cache, seed=1)
 
 
+@one_case
 class TestLogSource(DataSourceContract):
     @pytest.fixture
     def source(self, tmp_path):
@@ -137,6 +141,7 @@ class Swings(DataSource):
         return Splits([swing(0), swing(1)], [swing(2)], [swing(3)])
 
 
+@one_case
 class TestOwnSource(DataSourceContract):
     @pytest.fixture
     def source(self):

@@ -12,6 +12,7 @@ from pinn_dyn.systems import SoftArm
 from reproduce import ENTRIES, read_entries
 from tests.docs.commands import check_python
 
+SLOW = pytest.mark.slow
 Q = {"strongly_bent": [1.2, -0.2, 0.15], "bent": [0.8, 0.2, 0.3]}
 # The matrices that the paper prints.
 LEARNED = {
@@ -69,16 +70,21 @@ def test_the_papers_errors_follow_from_the_matrices_that_it_prints(model, config
         assert float(error) == pytest.approx(expected, abs=0.051), term
 
 
-@pytest.mark.parametrize("name", read_entries())
-def test_the_commands_of_an_entry_compose(name, tmp_path):
-    entry = read_entries()[name]
-    trainings = entry.get("train", [])
-    for train in [trainings] if isinstance(trainings, str) else trainings:
-        words = [word for word in shlex.split(train) if not word.startswith("seed=")]
-        check_python(["train.py", "-m", *words], tmp_path)
-    if "evaluate" in entry:
-        check_python(["evaluate.py", "runs=[x]", *shlex.split(entry["evaluate"])], tmp_path)
-    if "control" in entry:
-        check_python(["control.py", "run=x", *shlex.split(entry["control"])], tmp_path)
-    earlier = list(read_entries())[: list(read_entries()).index(name)]
-    assert set(entry.get("runs", ())) <= set(earlier)
+@pytest.mark.parametrize("part", [slice(None, None, 5), pytest.param(slice(None), marks=SLOW)])
+def test_the_commands_of_the_entries_compose(tmp_path, part):
+    """Every fifth of them, all with make test-slow."""
+    earlier = set()
+    commands = set()
+    for name, entry in read_entries().items():
+        trainings = entry.get("train", [])
+        for train in [trainings] if isinstance(trainings, str) else trainings:
+            words = [word for word in shlex.split(train) if not word.startswith("seed=")]
+            commands.add(("train.py", "-m", *words))
+        for program, run in (("evaluate", "runs=[x]"), ("control", "run=x")):
+            if program in entry:
+                commands.add((f"{program}.py", run, *shlex.split(entry[program])))
+        assert set(entry.get("runs", ())) <= earlier, name
+        earlier.add(name)
+    assert len(commands) > 50
+    for words in sorted(commands)[part]:
+        check_python([*words], tmp_path)

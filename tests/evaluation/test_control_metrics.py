@@ -11,10 +11,7 @@ from pinn_dyn.evaluation.control_metrics import (
     closed_loop_metrics,
     stopped_runs,
 )
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
+from tests.support.linear import double
 
 
 def make_record(t, q, q_ref, u=None, stopped=None):

@@ -80,8 +80,7 @@ def test_a_delay_is_measured_warned_of_and_given_as_a_step():
     assert again.delay is None
 
 
-@pytest.mark.parametrize("late", [0, 3])
-@pytest.mark.parametrize("dry", [0.0, 0.3])
+@pytest.mark.parametrize(("dry", "late"), [(0.3, 0), (0.0, 3), (0.3, 3)])
 def test_joints_that_rest_in_turn_get_their_friction_and_no_false_delay(dry, late):
     item = resting(dry, late=late)
     columns = {"t": item.t} | {f"q{k + 1}": item.q[:, k] for k in range(2)}

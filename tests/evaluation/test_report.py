@@ -132,6 +132,7 @@ def test_the_slider_offers_the_median_and_the_worst_trajectories(prediction, mon
     assert sorted(drawn)[int(control["value"])] == 2
 
 
+@pytest.mark.slow
 def test_a_slider_of_large_figures_stays_small():
     def figures():
         for number in range(20):

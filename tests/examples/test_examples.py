@@ -93,6 +93,7 @@ def test_export_and_call(own_log):
     assert "the same as before the export: True" in run("export_and_call.py", RUN)
 
 
+@pytest.mark.slow
 def test_simulate_and_learn():
     text = run("simulate_and_learn.py", "--steps", "2", "--duration", "2.0")
     assert "mean error over 2 s: {'Δx [rad]'" in text
@@ -106,6 +107,7 @@ def test_own_robot():
     assert "M learned" in run("own_robot.py", "--steps", "2")
 
 
+@pytest.mark.slow
 def test_lqr():
     """The gains of the true robot balance it, and an untrained model has gains of finite size."""
     assert "K learned" in run("lqr.py", "--steps", "2")
@@ -155,6 +157,7 @@ def test_write_example_bag(home):
     assert train.q[:, 0].std() > 1.2 * train.q[:, 1].std() > 0.1  # shoulder and elbow
 
 
+@pytest.mark.slow
 def test_swing_up(home):
     pytest.importorskip("casadi")
     out = run("swing_up.py", "--steps", "2", "--starts", "1", "--duration", "0.1")

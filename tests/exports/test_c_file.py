@@ -155,7 +155,7 @@ def test_powers_are_powers_and_constants_of_floats_are_floats(tmp_path):
     subprocess.run(command, cwd=tmp_path, check=True)
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", ["double", pytest.param("float", marks=pytest.mark.slow)])
 def test_the_stack_of_the_header_suffices(tmp_path, real):
     model = MODELS[CONSTANT]().double().eval().requires_grad_(False)
     path = export(model, tmp_path / "arm.c", real=real)

@@ -63,7 +63,13 @@ def rolled_out(model, batch=(), count=80, interpolation="linear", scale=1.0):
 
 
 @pytest.mark.parametrize(
-    ("kind", "batch"), [*((kind, (2, 3)) for kind in MODELS), ("momentum", ()), ("ensemble", ())]
+    ("kind", "batch"),
+    [
+        *((kind, (2, 3)) for kind in MODELS if kind != "servo"),
+        pytest.param("servo", (2, 3), marks=pytest.mark.slow),
+        ("momentum", ()),
+        ("ensemble", ()),
+    ],
 )
 def test_the_loop_gives_the_states_of_the_model(kind, batch):
     interpolation = {"known": "hold", "rosenbrock": "cubic"}.get(kind, "linear")

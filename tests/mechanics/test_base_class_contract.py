@@ -8,8 +8,10 @@ import torch
 
 from pinn_dyn.testing import LinearSystem, MechanicalSystemContract, damped_oscillators
 from tests.support.cart_pole import CartPole
+from tests.support.contracts import one_case
 
 
+@one_case
 class TestLinearSystem(MechanicalSystemContract):
     @pytest.fixture
     def system(self):
@@ -26,6 +28,7 @@ class SlidingMasses(LinearSystem):
         return 0.8 / 0.3 * (1 - torch.tanh(v / 0.3) ** 2)
 
 
+@one_case
 class TestDryFriction(MechanicalSystemContract):
     @pytest.fixture(params=["qv", "qp"])
     def system(self, request):
@@ -33,6 +36,7 @@ class TestDryFriction(MechanicalSystemContract):
         return SlidingMasses(values, values, values, [[1.0], [0.5]], state=request.param)
 
 
+@one_case
 class TestCartPole(MechanicalSystemContract):
     @pytest.fixture(params=["qv", "qp"])
     def system(self, request):

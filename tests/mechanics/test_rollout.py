@@ -47,7 +47,7 @@ def test_held_input_in_float32_uses_each_intervals_own_sample(system, substeps):
     torch.testing.assert_close(x.double(), expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("integrator", [RK4(1), RK4(2), Rosenbrock(1), Rosenbrock(2)])
+@pytest.mark.parametrize("integrator", [RK4(2), Rosenbrock(1)])
 @pytest.mark.parametrize("direction", [-np.inf, np.inf])
 def test_times_off_by_a_last_digit_take_the_same_samples_of_a_held_input(
     system, integrator, direction

@@ -39,18 +39,19 @@ def expected_value(signal, time, side="right"):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [1, 2, 7])
-def test_values_are_those_of_the_definition(kind, count):
+def test_values_are_those_of_the_definition(kind):
     """At random times, at the samples, and beyond both ends."""
-    signal = make_signal(kind, count)
-    times = [*np.linspace(-0.3, float(signal.t[-1]) + 0.4, 12), *signal.t.tolist()]
-    for time in times:
-        found = signal(time).numpy()
-        np.testing.assert_allclose(found, expected_value(signal, time), atol=1e-12, rtol=0)
+    for count in (1, 2, 7):
+        signal = make_signal(kind, count)
+        times = [*np.linspace(-0.3, float(signal.t[-1]) + 0.4, 12), *signal.t.tolist()]
+        for time in times:
+            found = signal(time).numpy()
+            np.testing.assert_allclose(found, expected_value(signal, time), atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [1, 2, 7])
+@pytest.mark.parametrize(
+    ("kind", "count"), [("hold", 2), ("linear", 1), ("cubic", 2), *((kind, 7) for kind in KINDS)]
+)
 def test_the_stages_of_a_step_see_the_signal_from_within_it(kind, count):
     signal = make_signal(kind, count)
     grid = torch.linspace(-0.3, float(signal.t[-1]) + 0.4, 12, dtype=torch.float64)
@@ -66,8 +67,9 @@ def test_the_stages_of_a_step_see_the_signal_from_within_it(kind, count):
             np.testing.assert_allclose(found[k, stage], expected, atol=1e-10, rtol=0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [1, 2, 9])
+@pytest.mark.parametrize(
+    ("kind", "count"), [("hold", 2), ("linear", 1), ("cubic", 2), *((kind, 9) for kind in KINDS)]
+)
 def test_means_over_steps_are_integrals_by_quadrature(kind, count):
     """Steps of many samples, within one, and beyond both ends."""
     signal = make_signal(kind, count, batch=(), size=1)

@@ -7,8 +7,8 @@ from pinn_dyn.mechanics import Signal
 from pinn_dyn.testing import assert_near
 from tests.models.autodiff import autodiff_derivative, rk4_increment
 from tests.models.builders import CHAIN, TRANSPOSED, VARIANTS, make_structured, random_batch
+from tests.support.contracts import slow_except
 
-MODELS = pytest.mark.parametrize("kind", ["lnn", "hnn"])
 STEP = 0.05
 
 
@@ -17,27 +17,23 @@ def batch_of(model):
     return torch.cat([q, second], -1), u, torch.cat([a, q], -1)
 
 
-ALL_MODELS = pytest.mark.parametrize(
-    ("kind", "variant"),
-    [(kind, VARIANTS[name]) for kind in ("lnn", "hnn") for name in VARIANTS]
-    + [("lnn", TRANSPOSED), *CHAIN.items(), ("hnn", {"state": "qv"})],
-    ids=[f"{kind}-{name}" for kind in ("lnn", "hnn") for name in VARIANTS]
-    + ["lnn-transposed", "lnn-chain", "hnn-chain", "hnn-in-velocities"],
-)
+MODELS = {
+    **{f"{kind} {name}": (kind, VARIANTS[name]) for kind in ("lnn", "hnn") for name in VARIANTS},
+    "lnn transposed": ("lnn", TRANSPOSED),
+    **{f"{kind} chain": (kind, settings) for kind, settings in CHAIN.items()},
+    "hnn in velocities": ("hnn", {"state": "qv"}),
+}
+ALIKE = ("constant", "fixed", "bounded")  # heads without second derivatives, or like others
+FAST = [name for name in MODELS if not name.split()[1].startswith(ALIKE)]
 
 
-@ALL_MODELS
-def test_state_derivative_is_that_of_the_scalar_function(kind, variant):
-    model = make_structured(kind, **variant)
-    x, u, _ = batch_of(model)
-    assert_near(model.state_derivative(x, u), autodiff_derivative(model, x, u), 1e-9)
-
-
-@ALL_MODELS
-def test_a_step_and_its_gradients_are_those_of_the_scalar_function(kind, variant):
-    """Second derivatives of the heads: the loss is a function of first derivatives."""
+@pytest.mark.parametrize("name", slow_except(MODELS, FAST))
+def test_state_derivative_is_that_of_the_scalar_function(name):
+    """So are a step and its gradients, by second derivatives of the heads."""
+    kind, variant = MODELS[name]
     model = make_structured(kind, **variant)
     x, u, target = batch_of(model)
+    assert_near(model.state_derivative(x, u), autodiff_derivative(model, x, u), 1e-9)
     leaves = [*model.parameters(), x.requires_grad_(True), u.requires_grad_(True)]
     t = torch.tensor([0.0, STEP], dtype=torch.float64)
     own = model.increments(x, t, Signal(t, torch.stack([u, 0.5 * u], -2)))[..., -1, :]

@@ -15,22 +15,18 @@ from pinn_dyn.models import (
 )
 from pinn_dyn.testing import FrictionContract, assert_near
 from tests.models.builders import make_scales, make_structured, perturb
-from tests.support.known import known_model, unit_scales
+from tests.support.contracts import one_case
+from tests.support.known import anywhere, known_model, unit_scales
 
 LAWS = [CoulombFriction, AsymmetricCoulomb, Stribeck]
 FORCE = torch.tensor([0.5, 2.0, 3.0], dtype=torch.float64)
 
 
-def anywhere(module, std=1.0, seed=0):
-    """The module with parameters far from their start."""
-    generator = torch.Generator().manual_seed(seed)
-    for parameter in module.parameters():
-        torch.nn.init.normal_(parameter, std=std, generator=generator)
-    return module.double()
-
-
-@pytest.mark.parametrize("prior", [False, True], ids=["network", "known mechanics"])
-@pytest.mark.parametrize("law", [NoFriction, *LAWS])
+@pytest.mark.parametrize(
+    ("law", "prior"),
+    [(NoFriction, False), (CoulombFriction, True), (AsymmetricCoulomb, False), (Stribeck, True)],
+)
+@one_case
 class TestFriction(FrictionContract):
     @pytest.fixture
     def head(self, law, prior):

@@ -20,6 +20,7 @@ from pinn_dyn.testing import (
     ResidualContract,
 )
 from tests.models.builders import make_scales, perturb
+from tests.support.contracts import one_case
 
 SIZE = 3
 FORCE = torch.tensor([0.5, 2.0, 3.0], dtype=torch.float64)
@@ -39,6 +40,7 @@ POTENTIALS = {
 
 
 @pytest.mark.parametrize("name", POTENTIALS)
+@one_case
 class TestPotential(PotentialContract):
     @pytest.fixture
     def head(self, name):
@@ -56,12 +58,14 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("name", INPUTS)
+@one_case
 class TestInput(InputMatrixContract):
     @pytest.fixture
     def head(self, name):
         return make(INPUTS[name], [0.5, 3.0])
 
 
+@one_case
 class TestResidual(ResidualContract):
     @pytest.fixture
     def head(self):

@@ -13,18 +13,12 @@ from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, R
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters
 from pinn_dyn.testing import MechanicalSystemContract
-from tests.support.known import known_model, statistics
+from tests.support.contracts import one_case
+from tests.support.known import anywhere, known_model, statistics
 from tests.support.rigid_chains import TREE
 
 
-def anywhere(module, std=1.0, seed=0):
-    """The module with parameters far from their start."""
-    generator = torch.Generator().manual_seed(seed)
-    for parameter in module.parameters():
-        torch.nn.init.normal_(parameter, std=std, generator=generator)
-    return module.double()
-
-
+@one_case
 class TestKnownMechanicsContract(MechanicalSystemContract):
     """With every kind of constant, away from the start."""
 

@@ -7,25 +7,21 @@ from pinn_dyn.models import KnownMechanics, KnownSystem
 from pinn_dyn.systems import RigidChain, SoftArm
 from pinn_dyn.testing import MechanicalSystemContract
 from tests.support.cart_pole import CartPole
-from tests.support.known import known_arm, known_cart_pole, statistics
+from tests.support.contracts import one_case, slow_except
+from tests.support.known import anywhere, known_arm, known_cart_pole, statistics
 from tests.support.rigid_chains import TREE
 
 
-def anywhere(model, std, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    for parameter in model.parameters():
-        torch.nn.init.normal_(parameter, std=std, generator=generator)
-    return model
-
-
+@one_case
 class TestKnownSoftArmContract(MechanicalSystemContract):
     """Away from the start; a segment of 2 m bends and lengthens by up to one."""
 
-    @pytest.fixture(params=[1, 2], ids=["one", "two"])
+    @pytest.fixture(params=slow_except([1, 2], [1]), ids=["one", "two"])
     def system(self, request):
         return anywhere(known_arm(request.param), std=0.3)
 
 
+@one_case
 class TestKnownCartPoleContract(MechanicalSystemContract):
     """Of a system that gives its four terms alone, with fewer inputs than coordinates."""
 

@@ -1,5 +1,7 @@
 """Models of robots that nothing drives: M = 0."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -10,6 +12,7 @@ from pinn_dyn.models.linear_rival import LinearRival
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.testing import LinearSystem, MechanicalSystemContract
 from tests.models.builders import STEP, make_model, make_statistics, make_structured, random_batch
+from tests.support.contracts import one_case
 from tests.support.rigid_chains import TREE
 
 T = STEP * torch.arange(60, dtype=torch.float64)
@@ -46,20 +49,21 @@ MODELS = {
 }
 
 
+@one_case
 class TestLagrangianNetwork(MechanicalSystemContract):
     @pytest.fixture
     def system(self):
         return make_structured("lnn", 2, 0)
 
 
+@one_case
 class TestKnownMechanics(MechanicalSystemContract):
     @pytest.fixture
     def system(self):
         return known()
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(("name", "n"), zip(MODELS, itertools.cycle([1, 2, 3]), strict=False))
 def test_predictions_without_inputs_are_finite_and_move(name, n):
     model = MODELS[name](n)
     q, v, _, u = random_batch(n, 0, batch=4)

@@ -25,6 +25,7 @@ from tests.models.builders import (
     make_statistics,
     make_structured,
 )
+from tests.support.contracts import slow_except
 from tests.support.outside_the_data import OutsideTheDataContract
 
 N = 2
@@ -80,7 +81,7 @@ class MechanicalNetwork(OutsideTheDataContract):
         return along_a_line(data)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_except(CASES, ["lnn qv network", "hnn qp network"]))
 class TestOutsideTheData(MechanicalNetwork):
     @pytest.fixture
     def system(self, case, seen):
@@ -91,7 +92,7 @@ class TestOutsideTheData(MechanicalNetwork):
         return limited(model, seen)
 
 
-@pytest.mark.parametrize("kind", CHAIN)
+@pytest.mark.parametrize("kind", slow_except(CHAIN, ["lnn"]))
 class TestASerialChain(MechanicalNetwork):
     """With the chain's mass and potential."""
 

@@ -25,12 +25,22 @@ from pinn_dyn.systems import RigidChain
 from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from pinn_dyn.training import LeastSquares
 from tests.models.builders import make_structured, random_batch
+from tests.support.contracts import one_case
 from tests.support.known import known_model, statistics, unit_scales
 from tests.support.rigid_chains import TREE
 
 
-@pytest.mark.parametrize("limit", [None, "learned", 2.0])
-@pytest.mark.parametrize("kind", ["lnn", "hnn", "feed-forward", "known", "sum"])
+@pytest.mark.parametrize(
+    ("kind", "limit"),
+    [
+        ("lnn", "learned"),
+        ("hnn", None),
+        ("feed-forward", 2.0),
+        ("known", "learned"),
+        pytest.param("sum", 2.0, marks=pytest.mark.slow),
+    ],
+)
+@one_case
 class TestServo(MechanicalSystemContract):
     gradient_tolerance = 2e-5  # the force bends at its limit within a finite difference
 

@@ -11,22 +11,27 @@ from tests.models.builders import (
     make_structured,
     random_batch,
 )
+from tests.support.contracts import one_case, slow_except
+
+MODELS = [(kind, variant) for kind in ("lnn", "hnn") for variant in VARIANTS]
+FAST = [
+    ("lnn", "silu-fixed-input-2x4"),
+    ("lnn", "friction-angle-and-length-3x3"),
+    ("hnn", "networks-softplus-3x3"),
+    ("hnn", "friction-all-angles-2x1"),
+]
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-class TestLagrangianNetwork(MechanicalSystemContract):
+@pytest.mark.parametrize("model", slow_except(MODELS, FAST), ids="-".join)
+@one_case
+class TestStructuredNetwork(MechanicalSystemContract):
     @pytest.fixture
-    def system(self, variant):
-        return make_structured("lnn", **VARIANTS[variant])
+    def system(self, model):
+        kind, variant = model
+        return make_structured(kind, **VARIANTS[variant])
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-class TestHamiltonianNetwork(MechanicalSystemContract):
-    @pytest.fixture
-    def system(self, variant):
-        return make_structured("hnn", **VARIANTS[variant])
-
-
+@one_case
 class TestTransposedMass(MechanicalSystemContract):
     @pytest.fixture
     def system(self):

@@ -23,6 +23,7 @@ from pinn_dyn.models import (
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from tests.models.builders import make_structured, perturb, random_batch
+from tests.support.contracts import one_case
 from tests.support.known import statistics
 from tests.support.rigid_chains import TREE
 
@@ -68,6 +69,7 @@ def exact(model):
     return model
 
 
+@one_case
 class TestSum(MechanicalSystemContract):
     """Of two networks with all terms."""
 
@@ -80,6 +82,7 @@ class TestSum(MechanicalSystemContract):
         return Sum(parts)
 
 
+@one_case
 class TestKnownAndNetwork(MechanicalSystemContract):
     @pytest.fixture
     def system(self):

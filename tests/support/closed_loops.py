@@ -8,12 +8,9 @@ from pinn_dyn.control.closed_loop import close_loop
 from pinn_dyn.control.plants import SystemPlant
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.testing import LinearSystem
+from tests.support.linear import double
 
 K_P, K_D = 30.0, 4.0
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 Q0, V0 = double([[0.5, -0.2], [1.0, 0.4], [-0.3, 0.0]]), double([[0.0, 1.0], [-1.0, 0.3], [2, 0]])
@@ -66,13 +63,14 @@ def sampled(plant=None, controller=None, reference=None, q0=Q0, v0=V0, **changes
 
 
 class Vanishing(MechanicalSystem):
-    """A free mass 1 - q that is gone at q = 1."""
+    """A free mass m(q), by default 1 - q, which is gone at q = 1."""
 
-    def __init__(self):
+    def __init__(self, mass=lambda q: 1 - q):
         super().__init__(num_coordinates=1, num_inputs=1)
+        self.mass = mass
 
     def mass_matrix(self, q):
-        return (1 - q).unsqueeze(-1)
+        return self.mass(q).unsqueeze(-1)
 
     def potential_energy(self, q):
         return 0 * q[..., 0]

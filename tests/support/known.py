@@ -35,6 +35,14 @@ def unit_scales(size, prior=True):
     return Scales(statistics(size), torch.ones(size, dtype=torch.float64), prior=prior)
 
 
+def anywhere(module, std=1.0, seed=0):
+    """The module in float64 with parameters far from their start."""
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in module.parameters():
+        torch.nn.init.normal_(parameter, std=std, generator=generator)
+    return module.double()
+
+
 def known_model(urdf=TREE, locked_joints=("wrist",), friction=Stribeck, **settings):
     """Generic bodies on the joints of the tree, in float64."""
     structure = RigidChain(urdf, locked_joints=locked_joints)

@@ -7,6 +7,10 @@ from scipy.linalg import expm
 from pinn_dyn.testing import LinearSystem
 
 
+def double(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
 def unit_masses(n):
     """n uncoupled unit masses on unit springs and dampers, each with its input: A = I."""
     return LinearSystem(np.eye(n), np.eye(n), np.eye(n), np.eye(n))

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from pinn_dyn.systems import RigidChain
+from tests.support.contracts import slow_except
 
 pinocchio = pytest.importorskip("pinocchio", reason="the dev extra is not installed")
 FOLDER = Path(importlib.util.find_spec("pinocchio").origin).parents[4]
@@ -21,7 +22,8 @@ def test_there_are_66_robots():
     assert len(FILES) >= 66
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+# Every sixth in turn, all with make test-slow.
+@pytest.mark.parametrize("path", slow_except(FILES, FILES[::6]), ids=lambda path: path.stem)
 def test_a_robot_has_the_terms_that_it_has_in_pinocchio(path):
     """All joints free, also those that mimic others, in the order of Pinocchio."""
     model = pinocchio.buildModelFromUrdf(str(path))

@@ -11,6 +11,7 @@ from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia
 from pinn_dyn.testing import MechanicalSystemContract
+from tests.support.contracts import one_case
 from tests.support.rigid_chains import TREE, joint, link, robot
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -98,6 +99,7 @@ def test_a_chain_equals_pinocchio(name, locked):
         assert_same(ours, slope[:, order][:, :, order])
 
 
+@one_case
 class TestRigidChainContract(MechanicalSystemContract):
     @pytest.fixture
     def system(self):
@@ -303,6 +305,7 @@ def test_mimic_joints_are_held_with_a_joint_that_is_locked():
     torch.testing.assert_close(chain.tree.placements, other.tree.placements)
 
 
+@one_case
 class TestCoupledChainContract(MechanicalSystemContract):
     @pytest.fixture
     def system(self):

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import assert_near
+from tests.support.linear import double
 
 # Table "Mathematical model matrices of one-segment soft manipulator" of the paper, as printed.
 PRINTED = [
@@ -29,10 +30,6 @@ PRINTED = [
     },
 ]
 LENGTH, MASS, GRAVITY = 0.2, 0.3, 9.81
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def half_unit(printed):

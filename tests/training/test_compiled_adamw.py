@@ -46,8 +46,8 @@ def trained(model, clipping, compiled, state=None, steps=range(STEPS)):
 @pytest.mark.parametrize(
     ("clipping", "built"),
     [
-        ((None, False), False),
-        ((0.02, True), False),
+        pytest.param((None, False), False, marks=pytest.mark.slow),
+        pytest.param((0.02, True), False, marks=pytest.mark.slow),
         ((0.3, False), False),
         pytest.param((0.3, False), True, marks=pytest.mark.slow),
     ],
@@ -66,6 +66,7 @@ def test_weights_gradients_and_moments_are_those_of_the_optimizer(request, clipp
     assert float(state[0]["state"][0]["step"]) == STEPS
 
 
+@pytest.mark.slow
 def test_steps_go_on_from_a_saved_state_of_the_optimizer(traced):
     model = make_model("lnn")
     whole, _, _ = trained(copy.deepcopy(model), (0.3, False), compiled=True)

@@ -117,7 +117,7 @@ def test_the_program_of_a_robot_with_twelve_joints_compiles():
     assert_same(program(windows, part=4), engine(Eager, loss, model)(windows))
 
 
-@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("size", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_an_experimental_option_of_the_compiler_cannot_end_a_training(monkeypatch, size):
     """Small programs are compiled again without it, and large ones never get it."""
     tried = []
@@ -160,6 +160,7 @@ def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(
         assert_same((losses[k], gradients[k]), engine(Eager, loss, member)(batch))
 
 
+@pytest.mark.slow
 def test_a_program_of_all_members_has_the_same(traced):
     """It is what a GPU takes."""
     mass = partial(NetworkCholesky, hidden=[3])

@@ -95,6 +95,7 @@ def test_the_dynamics_are_found_from_a_generic_start(truth, runs, unseen, rollou
     assert torch.linalg.eigvalsh(result.covariance).min() > 0
 
 
+@pytest.mark.slow
 def test_a_payload_is_found_from_seconds_where_all_else_is_known(truth, runs):
     windows = draw_windows(runs, count=4, steps=1, stride=1, seed=0)
     solver = LeastSquares(cutoff=20.0, rollouts=False)
@@ -245,7 +246,10 @@ def solved(monkeypatch):
     return begun
 
 
-@pytest.mark.parametrize(("minimization", "evaluation"), [(1, 2), (1, 8), (3, 4)])
+@pytest.mark.parametrize(
+    ("minimization", "evaluation"),
+    [pytest.param(1, 2, marks=pytest.mark.slow), (1, 8), (3, 4)],
+)
 def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
     truth, runs, unseen, solved, monkeypatch, minimization, evaluation
 ):
@@ -277,7 +281,9 @@ def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
     assert not found.prior.mean.any()
 
 
-@pytest.mark.parametrize("at", [0, 3], ids=["at once", "interrupted"])
+@pytest.mark.parametrize(
+    "at", [pytest.param(0, marks=pytest.mark.slow), 3], ids=["at once", "interrupted"]
+)
 def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
     """Windows that start at wrong velocities spoil the rollouts, not the identification."""
     windows = draw_windows(runs, count=20, steps=4, stride=1, seed=0)

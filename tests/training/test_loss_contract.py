@@ -6,6 +6,7 @@ import pytest
 
 from pinn_dyn.testing import WindowLossContract
 from pinn_dyn.training import IncrementLoss, MidpointLoss
+from tests.support.contracts import one_case
 
 LOSSES = {
     "increment": IncrementLoss,
@@ -14,6 +15,7 @@ LOSSES = {
 }
 
 
+@one_case
 class TestLosses(WindowLossContract):
     @pytest.fixture(params=LOSSES.values(), ids=LOSSES)
     def make(self, request):
