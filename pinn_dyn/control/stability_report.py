@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
+import torch
 from torch import Tensor
 
 MEASUREMENT_TOLERANCE = 1e-6
@@ -15,9 +16,9 @@ MEASUREMENT_TOLERANCE = 1e-6
 def stability_report(
     title: str,
     conditions: pd.DataFrame,
-    steady_states: pd.DataFrame,
-    measured: Tensor,
-    required_gains: Mapping[float, Tensor],
+    steady_states: pd.DataFrame | None = None,
+    measured: Tensor | None = None,
+    required_gains: Mapping[float, Tensor] | None = None,
 ) -> str:
     """Return Proposition 1 for one model in Markdown.
 
@@ -43,7 +44,6 @@ def stability_report(
         rows.append([name, conditions[key].median(), worst, "-" if good is None else _share(good)])
     coordinates = [name for name in conditions if name[:1] == "q"]
     farthest = conditions.nlargest(3, "rest_error")[[*coordinates, "rest_error"]]
-    gains = [[error, k.median(), k.max()] for error, k in required_gains.items()]
     sections = [
         f"# {title}",
         f"Proposition 1 of the paper at {len(conditions)} configurations, and not between them. "
@@ -52,10 +52,17 @@ def stability_report(
         _table(["", "median", "worst", "holds at"], rows),
         "Configurations with the largest `rest_error`, the distance from the set point at rest:",
         _table(list(farthest), farthest.to_numpy().tolist()),
-        *_steady_states(steady_states, measured),
-        "## Gain for a desired steady-state error",
-        "The smallest scalar K_P for which the bound is no larger, the κ of Proposition 1.",
-        _table(["error", "K_P, median set point", "K_P, all set points"], gains),
+    ]
+    if steady_states is not None:
+        sections += _steady_states(steady_states, measured)
+    if required_gains:
+        gains = [[error, k.median(), k.max()] for error, k in required_gains.items()]
+        sections += [
+            "## Gain for a desired steady-state error",
+            "The smallest scalar K_P for which the bound is no larger, the κ of Proposition 1.",
+            _table(["error", "K_P, median set point", "K_P, all set points"], gains),
+        ]
+    sections += [
         "## Limits of this report",
         "- L carries a margin, not a proof. The bound holds near the set point; the report does "
         "not show that the arm gets there from far away.\n"
@@ -65,8 +72,9 @@ def stability_report(
     return "\n\n".join(sections) + "\n"
 
 
-def _steady_states(table: pd.DataFrame, measured: Tensor) -> list[str]:
-    held = table.assign(measured=measured.numpy())[table["holds"]]
+def _steady_states(table: pd.DataFrame, measured: Tensor | None) -> list[str]:
+    error = pd.Series(torch.nan if measured is None else measured.numpy(), table.index)
+    held = table.assign(measured=error)[table["holds"]]
     above = held["measured"] > held["bound"] + MEASUREMENT_TOLERANCE
     rows = [
         ["conditions hold", _share(table["holds"])],
