@@ -164,16 +164,19 @@ def panda_windows() -> str:
 
 
 def logs() -> str:
-    """Return the errors on the logs; the spread is that of the seeds, in the 1 s windows."""
+    """Return errors and durations on the logs; the spread is that of seeds, in the 1 s windows."""
     rows = []
     for log in LOGS:
         data = task(log).query("model in @MODELS")
         runs = data.groupby("model")[LONG]
         spread = (runs.max() - runs.min()).replace(0, None)
+        duration = data["training_seconds"].groupby("model").mean()
         for row in grid(data, [SHORT, LONG, "error_mean", "torque_share"], digits=3):
-            row.insert(3, number(spread[row[0].strip("`")]))
-            rows.append([log, *row])
-    return markdown(["log", "model", "0.1 s", "1 s", "spread", "open loop", "torque error"], rows)
+            name = row[0].strip("`")
+            row.insert(3, number(spread[name]))
+            rows.append([log, *row, number(duration[name])])
+    head = ["log", "model", "0.1 s", "1 s", "spread", "open loop", "torque error", "training, s"]
+    return markdown(head, rows)
 
 
 def intervals() -> str:
