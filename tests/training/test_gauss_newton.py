@@ -54,3 +54,17 @@ def test_the_limit_of_evaluations_ends_with_the_best_z():
     assert problem.evaluations == 3
     assert float(evaluate(problem.z, False).square().mean()) == pytest.approx(problem.noise**2)
     assert problem.noise < before
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_the_weight_of_the_data_never_decreases(robust):
+    """Larger residuals, as after a step to less likely constants, do not favor the prior."""
+    _, evaluate = exponential_problem(outliers=0)
+    zero = torch.zeros(3, dtype=torch.float64)
+    problem = GaussNewton(evaluate, zero, Prior(zero, torch.eye(3).double()), 1.0, robust)
+    problem.minimize(100, 1e-9, lambda: None)
+    weight, errors = problem._weight, evaluate(problem.z, False)
+    problem._move(problem.z, 10 * errors, torch.inf)
+    assert problem._weight == weight
+    problem._move(problem.z, errors / 10, torch.inf)
+    assert problem._weight == pytest.approx(10 * weight)
