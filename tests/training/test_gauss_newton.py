@@ -67,4 +67,4 @@ def test_the_weight_of_the_data_never_decreases(robust):
     problem._move(problem.z, 10 * errors, torch.inf)
     assert problem._weight == weight
     problem._move(problem.z, errors / 10, torch.inf)
-    assert problem._weight == pytest.approx(10 * weight)
+    assert problem._weight == pytest.approx(10 * weight, rel=0.05)
