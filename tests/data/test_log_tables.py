@@ -1,5 +1,7 @@
 """Signals in several tables, with clocks of their own, with empty cells, and in long tables."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -29,13 +31,21 @@ def assert_equal(log, table=TABLE, atol=0.0):
 
 
 @pytest.mark.parametrize("clock", ["all files", "file of q", "own file"])
-def test_signals_in_files_with_the_same_rows_are_one_run(tmp_path, clock):
+@pytest.mark.parametrize("ending", ["csv", "npz", "json"])
+def test_signals_in_files_with_the_same_rows_are_one_run(tmp_path, clock, ending):
     tables = parts(TABLE, clock == "all files")
     if clock == "own file":
         tables |= {"pos": TABLE[Q], "time": TABLE[T]}
     for name, table in tables.items():
-        write(tmp_path, table, f"{name}.csv")
-    log = source(tmp_path)
+        arrays = {key: column.to_numpy() for key, column in table.items()}
+        if ending == "csv":
+            write(tmp_path, table, f"{name}.csv")
+        elif ending == "npz":
+            np.savez(tmp_path / f"{name}.npz", **arrays)
+        else:
+            text = json.dumps({key: x.tolist() for key, x in arrays.items()})
+            (tmp_path / f"{name}.json").write_text(text)
+    log = source(tmp_path, files=f"*.{ending}")
     assert_equal(log)
     assert not log.warnings
 

@@ -231,7 +231,7 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
         elif name not in columns and base:
             problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
             problem += f"real numbers in {samples} rows."
-        elif name not in columns and name == request.time:
+        elif name not in columns and name == request.time and not request.partial:
             runs = (re.sub(rf"\d+([_./]{re.escape(name)})$", r"*\1", x) for x in arrays)
             run = next((f", write {x!r}, and so on." for x in runs if "*" in x), ".")
             problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or run} "

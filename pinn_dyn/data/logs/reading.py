@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -74,10 +74,11 @@ class Layout:
             if stem in paths:
                 raise LogError(f"{paths[stem]} and {path} are both the run {stem!r}: rename one")
             paths[stem] = path
+        request = replace(self.request, partial=len(paths) > 1)
         return {
             ":".join(x for x in (stem if len(paths) > 1 or not run else "", run) if x): table
             for stem, path in paths.items()
-            for run, table in read_tables(path, self.request).items()
+            for run, table in read_tables(path, request).items()
         }
 
     def recordings(

@@ -25,12 +25,14 @@ class Request:
         columns: all columns, those of the time among them. A reader may return more.
         max_age: oldest message of another topic of a bag that a row may use, s.
         sep: separator of the cells of a text file; None detects it.
+        partial: true if the time may be in another file.
     """
 
     time: str
     columns: Sequence[str]
     max_age: float = 0.1
     sep: str | None = None
+    partial: bool = False
 
 
 def vector_columns(name: str, cells: pd.Series) -> dict[str, pd.Series]:
