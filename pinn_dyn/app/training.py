@@ -62,6 +62,7 @@ from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import (
     AccelerationMLP,
+    CoupledOscillators,
     HamiltonianNetwork,
     KnownAndNetwork,
     KnownMechanics,
@@ -88,6 +89,7 @@ MODELS: dict[str, ModelBuilder] = {
     "acceleration": AccelerationMLP,
     "mlp": partial(NextStateMLP, activation="silu"),
     "subnet": SubspaceEncoder,
+    "oscillators": CoupledOscillators,
 }
 """Models by their names in conf/model."""
 LOSSES: dict[str, Callable[..., WindowLoss]] = {
@@ -157,14 +159,15 @@ def train(
     Args:
         source: the data.
         model: builder, called with ``statistics=``; or ``"lnn"``, ``"hnn"``, ``"acceleration"``,
-            ``"mlp"`` or ``"subnet"``; or a built predictor, which is trained in place.
+            ``"mlp"``, ``"subnet"`` or ``"oscillators"``; or a built predictor, which is trained in
+            place.
         loss: builder, called with ``statistics=`` and ``model=``; or ``"increment"`` or
             ``"midpoint"``.
         optimizer: builder, called with the parameters; or a least-squares fit.
         scheduler: builder, called with the optimizer and ``total_steps=``.
         data: builder of the training windows, called with ``source=``; None takes windows of two
-            steps of about 20 ms from a log (ten for least squares and subnet), and the defaults of
-            :class:`~pinn_dyn.data.DynamicsData` from other sources.
+            steps of about 20 ms from a log (ten for least squares, subnet and oscillators), and the
+            defaults of :class:`~pinn_dyn.data.DynamicsData` from other sources.
         validator: builder of the validation, called with ``training_step=``.
         steps: steps of the optimizer; None takes 1,000 on a log and 20,000 on other sources.
         validations: number of validations, a divisor of ``steps``; None takes up to 10 on a log
@@ -334,7 +337,9 @@ def _windows(source: DataSource, model: Any, optimizer: Any) -> Callable[..., Dy
     pairs, steps = (_FEW_PAIRS, _LONG_WINDOW) if few else (_PAIRS, _WINDOW)
     batch = min(_BATCH, pairs)
     windows = partial(DynamicsData, pairs=pairs, steps=steps, stride=stride, batch_size=batch)
-    return partial(windows, history=_HISTORY, steps=_LONG_WINDOW) if model == "subnet" else windows
+    if model in ("subnet", "oscillators"):
+        return partial(windows, history=_HISTORY * (model == "subnet"), steps=_LONG_WINDOW)
+    return windows
 
 
 def _same_data(source: DataSource, folder: Path, saved: Mapping[str, Any]) -> dict[str, Any]:

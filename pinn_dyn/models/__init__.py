@@ -31,6 +31,7 @@ from pinn_dyn.models.known_system import KnownSystem
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.oscillators import CoupledOscillators
 from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
 from pinn_dyn.models.residual import NetworkResidual
@@ -49,6 +50,7 @@ __all__ = [
     "ConstantCholesky",
     "ConstantInput",
     "CoulombFriction",
+    "CoupledOscillators",
     "ElasticJoints",
     "FixedCholesky",
     "FixedInput",

@@ -1,7 +1,8 @@
-"""Black box with a memory: a latent state that an encoder computes from the past."""
+"""Models with a latent state that an encoder computes from the measured state and its past."""
 
 from __future__ import annotations
 
+import abc
 import itertools
 from collections.abc import Sequence
 from typing import Annotated
@@ -47,21 +48,19 @@ class LinearAndMLP(nn.Module):
         return y + h
 
 
-class SubspaceEncoder(Predictor):
-    """State-space network with a latent state z that an encoder computes from the past (SUBNET)::
+class EncodedPredictor(Predictor):
+    """State-space model with a latent state z that an encoder computes from the past::
 
-        z_0     = encoder(q_0, v_0, q_-1, ... q_-n, u_0, ... u_-n)
-        z_{k+1} = z_k + transition(z_k, u_k, u_{k+1})
-        y_k     = output(z_k) + fade^k (y_0 - output(z_0)),      y = (q, v)
+        z_0 = encoder(q_0, v_0, q_-1, ... q_-n, u_0, ... u_-n)
+        y_k = output(z_k) + fade^k (y_0 - output(z_0)),      y = (q, v)
 
     Symbols: latent state z ``(*batch, latent)``, state y of the robot ``(*batch, 2N)``, fade
-    ``(2N,)``. y, q and u are normalized by their means and standard deviations. Each network is the
-    sum of a linear map and an MLP. The last term starts the prediction at the measured y_0. fade is
-    learned, between 0 and 1. Training on windows of many steps is the truncated simulation loss.
+    ``(2N,)``. y, q and u are normalized by their means and standard deviations. The encoder and the
+    output are sums of a linear map and an MLP. The last term starts the prediction at the measured
+    y_0. fade is learned, between 0 and 1. Subclasses define how z moves (:meth:`latent_path`).
 
-    z may hold states that are not measured, such as those of actuators. Unknown q and u before the
-    start repeat the first sample: the robot was at rest. The model has no function of (q, v) for
-    control laws and exports.
+    Unknown q and u before the start repeat the first sample: the robot was at rest. The model has
+    no function of (q, v) for control laws and exports.
 
     Source: Beintema, Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system
     identification". The fading term is not part of it.
@@ -81,10 +80,10 @@ class SubspaceEncoder(Predictor):
     def __init__(
         self,
         statistics: Statistics,
-        history: Annotated[float, Field(ge=0, le=2)] = 0.5,
-        latent: PositiveInt = 12,
-        hidden: Sequence[PositiveInt] = (64,),
-        activation: Activation = "tanh",
+        history: float,
+        latent: int,
+        hidden: Sequence[PositiveInt],
+        activation: Activation,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs)
@@ -95,11 +94,24 @@ class SubspaceEncoder(Predictor):
             self.register_buffer(name, torch.cat([q, v, *[q] * n, *[u] * (n + 1)]))
         self.register_buffer("step", torch.tensor(statistics.step, dtype=torch.float64))
         self.encoder = LinearAndMLP(len(self.mean), latent, hidden, activation)
-        self.transition = LinearAndMLP(latent + 2 * inputs, latent, hidden, activation)
+        self._add_transition(inputs, latent, hidden, activation)
         self.output = LinearAndMLP(latent, 2 * size, hidden, activation)
-        with torch.no_grad():  # decay, so that the first rollouts over many steps do not diverge
-            self.transition.first.weight[:latent, :latent] -= 0.5 * torch.eye(latent)
         self.fade = nn.Parameter(torch.zeros(2 * size))
+
+    @abc.abstractmethod
+    def _add_transition(
+        self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation
+    ) -> None:
+        """Add the parameters of :meth:`latent_path`."""
+
+    @abc.abstractmethod
+    def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
+        """Return the latent states z_0, ... z_T, ``(*batch, latent)`` each.
+
+        Args:
+            z: z_0, ``(*batch, latent)``.
+            ends: normalized inputs at the start and the end of each step, ``(T, *batch, 2M)``.
+        """
 
     @property
     def fixed_step(self) -> float:  # type: ignore[override]
@@ -107,7 +119,7 @@ class SubspaceEncoder(Predictor):
         return float(self.step)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Apply the network step by step.
+        """Apply the model step by step.
 
         Raises:
             ValueError: if the spacing of ``t`` is not the step of the training windows.
@@ -119,16 +131,47 @@ class SubspaceEncoder(Predictor):
         past = torch.cat([x0, *at_rest], dim=-1)[..., : (2 + n) * size]
         past = torch.cat([past, *input.at(before).to(x0)], dim=-1)
         z = self.encoder((past - self.mean) / self.std)
-        path = [z]
         ends = torch.cat(input.stages(t, (0.0, 1.0)).to(x0).unbind(1), dim=-1)
         mean, std = (x[len(x) - self.num_inputs :].repeat(2) for x in (self.mean, self.std))
-        first = self.transition.first
-        of_z, of_u = first.weight.tensor_split([z.shape[-1]], dim=1)
-        for drive in F.linear((ends - mean) / std, of_u, first.bias):  # all steps in one product
-            z = z + self.transition.after_first(drive + z @ of_z.T)
-            path.append(z)
-        y = self.output(torch.stack(path, dim=-2))
+        y = self.output(torch.stack(self.latent_path(z, (ends - mean) / std), dim=-2))
         mean, std = self.mean[: 2 * size], self.std[: 2 * size]
         offset = (x0[..., None, : 2 * size] - mean) / std - y[..., :1, :]
         steps = torch.arange(len(t), device=t.device)[:, None]
         return std * (y - y[..., :1, :] + offset * (torch.sigmoid(self.fade) ** steps - 1))
+
+
+class SubspaceEncoder(EncodedPredictor):
+    """Black box with a memory (SUBNET)::
+
+        z_{k+1} = z_k + transition(z_k, u_k, u_{k+1})
+
+    The transition is the sum of a linear map and an MLP. z may hold states that are not measured,
+    such as those of actuators. Training on windows of many steps is the truncated simulation loss.
+    The encoder and the output are those of :class:`EncodedPredictor`, as are the arguments.
+    """
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        history: Annotated[float, Field(ge=0, le=2)] = 0.5,
+        latent: PositiveInt = 12,
+        hidden: Sequence[PositiveInt] = (64,),
+        activation: Activation = "tanh",
+    ):
+        super().__init__(statistics, history, latent, hidden, activation)
+
+    def _add_transition(
+        self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation
+    ) -> None:
+        self.transition = LinearAndMLP(latent + 2 * inputs, latent, hidden, activation)
+        with torch.no_grad():  # decay, so that the first rollouts over many steps do not diverge
+            self.transition.first.weight[:latent, :latent] -= 0.5 * torch.eye(latent)
+
+    def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
+        path = [z]
+        first = self.transition.first
+        of_z, of_u = first.weight.tensor_split([z.shape[-1]], dim=1)
+        for drive in F.linear(ends, of_u, first.bias):  # all steps in one product
+            z = z + self.transition.after_first(drive + z @ of_z.T)
+            path.append(z)
+        return path

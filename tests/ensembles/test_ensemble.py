@@ -11,7 +11,7 @@ from pinn_dyn.models import LearnedVelocity, NetworkResidual
 from pinn_dyn.models.output_limits import output_limits, set_output_limits
 from tests.models.builders import make_model, make_structured, perturb
 
-KINDS = ("lnn", "hnn", "acceleration", "next_state", "subnet")
+KINDS = ("lnn", "hnn", "acceleration", "next_state", "subnet", "oscillators")
 
 
 def members(kind, count=3):
@@ -20,7 +20,7 @@ def members(kind, count=3):
 
 def motion(kind, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    step = 0.02 if kind in ("next_state", "subnet") else 0.002
+    step = 0.02 if kind in ("next_state", "subnet", "oscillators") else 0.002
     t = step * torch.arange(6, dtype=torch.float64)
     x0 = 0.3 * torch.randn(4, 4, generator=generator, dtype=torch.float64)
     return x0, t, torch.randn(4, 6, 2, generator=generator, dtype=torch.float64)

@@ -13,6 +13,7 @@ from pinn_dyn.models import (
     ConstantCholesky,
     ConstantInput,
     CoulombFriction,
+    CoupledOscillators,
     FixedCholesky,
     FixedInput,
     HamiltonianNetwork,
@@ -148,7 +149,7 @@ def make_structured(
 
 
 def make_model(kind, n=2, m=2, dtype=torch.float64):
-    """One of the five models."""
+    """One of the six models."""
     if kind in ("lnn", "hnn"):
         return make_structured(kind, n, m, dtype=dtype)
     torch.manual_seed(7)
@@ -156,6 +157,7 @@ def make_model(kind, n=2, m=2, dtype=torch.float64):
         "next_state": NextStateMLP,
         "acceleration": AccelerationMLP,
         "subnet": partial(SubspaceEncoder, history=3 * STEP, latent=5),
+        "oscillators": partial(CoupledOscillators, oscillators=3, force_hidden=[4]),
     }[kind]
     return perturb(black_box(make_statistics(n, m), hidden=[6, 5]).to(dtype))
 

@@ -1,0 +1,107 @@
+"""Mechanics in latent coordinates: coupled oscillators, which are stable by construction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field, PositiveInt
+from torch import Tensor, nn
+
+from pinn_dyn.models.mlp import Activation
+from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.models.subspace_encoder import EncodedPredictor, LinearAndMLP
+
+_SLOWEST, _FASTEST = 0.05, 1.5  # initial eigenfrequencies, rad in a step
+_DAMPING = 0.5  # initial damping ratio
+_SPREAD = 0.5  # initial entries of the factors of K and D, times the root of n
+
+
+class CoupledOscillators(EncodedPredictor):
+    r"""Oscillators in latent coordinates with stiffness, damping and coupling::
+
+        z'' = f(u) - K z - D z' - W^T tanh(W z + b)
+        V(z) = z^T K z / 2 + sum of log cosh(W z + b)
+
+    Symbols: latent coordinates z ``(*batch, n)``; K and D ``(n, n)``, symmetric positive definite
+    by their Cholesky factors; W ``(n, n)``, b ``(n,)``; force f of the inputs, a linear map plus an
+    MLP. The unit of time is a step, that of mass is 1. The coupling is the slope of a convex
+    potential, so the system with a constant input has one equilibrium, which is globally stable,
+    and it is input-to-state stable.
+
+    A step is exact for the linear part, by a matrix exponential. The force, the mean of f at both
+    ends, and the coupling at the start of the step are held::
+
+        x_{k+1} = E x_k + G (f - W^T tanh(W z_k + b)),      x = (z, z')
+
+    All rollouts are bounded at any step: E is the flow of damped oscillators, whose powers vanish,
+    and the held force is bounded by that of the inputs and by the norm of W.
+
+    Source: Stölzle and Della Santina (2024), "Input-to-state stable coupled oscillator networks for
+    closed-form model-based control in latent space". The encoder and the output are those of
+    :class:`EncodedPredictor`, with the latent state (z, z').
+
+    Args:
+        statistics: scales of the data.
+        history: time before the start that the encoder sees, s; n steps of the training windows.
+        oscillators: number n of latent coordinates.
+        hidden, activation: widths and activation of the hidden layers of encoder and output.
+        force_hidden: widths of the hidden layers of f.
+    """
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        history: Annotated[float, Field(ge=0, le=2)] = 0.0,
+        oscillators: PositiveInt = 24,
+        hidden: Sequence[PositiveInt] = (128,),
+        activation: Activation = "tanh",
+        force_hidden: Sequence[PositiveInt] = (64,),
+    ):
+        self._force_hidden = force_hidden
+        super().__init__(statistics, history, 2 * oscillators, hidden, activation)
+
+    def _add_transition(
+        self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation
+    ) -> None:
+        n = latent // 2
+        frequency = torch.linspace(math.log(_SLOWEST), math.log(_FASTEST), n)
+        mixed = _SPREAD * torch.randn(2, n, n) / n**0.5
+        self.force = LinearAndMLP(inputs, n, self._force_hidden, activation)
+        self.stiffness = nn.Parameter(torch.diag(frequency) + mixed[0].tril(-1))
+        damping = (frequency + math.log(2 * _DAMPING)) / 2
+        self.damping = nn.Parameter(torch.diag(damping) + mixed[1].tril(-1))
+        self.coupling = nn.Parameter(torch.randn(n, n) / n**0.5)
+        self.bias = nn.Parameter(torch.randn(n))
+
+    def matrices(self) -> tuple[Tensor, Tensor]:
+        """Return K and D, ``(n, n)`` each, in units of a step."""
+        factors = (
+            raw.tril(-1) + torch.diag(raw.diagonal().exp())
+            for raw in (self.stiffness, self.damping)
+        )
+        K, D = (factor @ factor.T for factor in factors)
+        return K, D
+
+    def flow(self) -> tuple[Tensor, Tensor]:
+        """Return E ``(2n, 2n)`` and G ``(2n, n)`` of a step."""
+        K, D = self.matrices()
+        zero, one = torch.zeros_like(K), torch.eye(len(K)).to(K)
+        rows = [[zero, one, zero], [-K, -D, one], [zero, zero, zero]]
+        flow = torch.matrix_exp(torch.cat([torch.cat(row, dim=1) for row in rows]))
+        return flow[: 2 * len(K), : 2 * len(K)], flow[: 2 * len(K), 2 * len(K) :]
+
+    def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
+        n = len(self.bias)
+        E, G = self.flow()
+        start, end = ends.chunk(2, dim=-1)
+        drives = F.linear((self.force(start) + self.force(end)) / 2, G)
+        path = [z]
+        for drive in drives:
+            coupling = torch.tanh(F.linear(z[..., :n], self.coupling, self.bias)) @ self.coupling
+            z = F.linear(z, E) + drive - F.linear(coupling, G)
+            path.append(z)
+        return path
