@@ -16,7 +16,7 @@ from reproduce import ENTRIES, RESULTS, ROOT, recorded
 
 BASELINES = ["hold position", "constant velocity", "ARX", "EDMDc"]
 MODELS = ["identification", "known", "known_and_network", "lnn", "lnn_residual"]
-MODELS += ["acceleration", "mlp", "subnet", *BASELINES]
+MODELS += ["oscillators", "acceleration", "mlp", "subnet", *BASELINES]
 LOGS = ["double_pendulum", "ur10e", "panda_gaz", "emps", "soft_neck", "trunk"]
 CONTROL = {  # table: robot, metric, factor, tasks
     "regulation": ["soft_arm_2", "step_error_after_1_s_mean_percent", 1, "regulation"],
