@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import InputDelay, Recording, clear_delays, input_delays
+from pinn_dyn.data.logs import DelayCurve, InputDelay, Recording, clear_delays, input_delays
 from tests.support.delayed_robots import log, seven_regressor, sines
 
 
@@ -99,3 +99,15 @@ def test_friction_that_rises_near_rest_is_no_delay():
     curves = input_delays([Recording("run", t[::4], measured, None, inputs)])
     assert curves[0].dry
     assert clear_delays(curves, 0.004) == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("delay", "spread", "clear"),
+    [(1.5, 0.2, True), (1.5, 0.5, False), (0.9, 0.01, False), (1.1, 0.01, True)],
+)
+def test_the_hold_of_a_sample_is_no_delay(delay, spread, clear):
+    """A delay counts from one sample on, if its interval excludes the half sample of a hold."""
+    step = 0.01
+    d = step * np.arange(-2, 9)
+    curve = DelayCurve(d, np.ones(len(d)), delay * step, spread * step, "inverse dynamics")
+    assert clear_delays([curve], step) == pytest.approx([delay * step * clear])
