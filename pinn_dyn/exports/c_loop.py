@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import hashlib
 import logging
 import pickle
+import sys
 from collections import Counter
 from contextlib import suppress
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -149,13 +152,47 @@ class _Values(Constants):
 
 
 class _Content(pickle.Pickler):
-    """Pickler that writes a tensor as its type, shape and numbers, and a set in order."""
+    """Pickler that writes tensors as their numbers, sets in order, and classes with their files."""
 
     def persistent_id(self, value: Any) -> Any:
         if isinstance(value, Tensor):
             array = value.detach().numpy()
             return str(array.dtype), array.shape, array.tobytes()
+        if isinstance(value, type):
+            return _origin(value)
         return sorted(map(str, value)) if isinstance(value, set) else None
+
+
+@functools.cache
+def _origin(kind: type) -> str:
+    """Return the names of a class and its bases, and the size and time of their files.
+
+    Raises:
+        TypeError: for a class without a file, as in a notebook, whose changes nothing tells.
+    """
+    parts = [kind.__qualname__]
+    for module in dict.fromkeys(base.__module__ for base in kind.__mro__):
+        file = getattr(sys.modules.get(module), "__file__", None)
+        if file is None and module not in sys.builtin_module_names:
+            raise TypeError(f"{kind} has no file")
+        own = module.startswith("pinn_dyn.")
+        parts.append(f"{module} {_package() if own else _state(file)}")
+    return "; ".join(parts)
+
+
+@functools.cache
+def _package() -> str:
+    """Return the sizes and times of the files of this package."""
+    files = sorted(Path(__file__).parents[1].rglob("*.py"))
+    return hashlib.sha256("".join(map(_state, files)).encode()).hexdigest()
+
+
+def _state(file: str | Path | None) -> str:
+    """Return the size and the time of change of a file; "" of a module that is built in."""
+    if file is None:
+        return ""
+    status = Path(file).stat()
+    return f"{status.st_size} {status.st_mtime_ns};"
 
 
 _LOOPS: dict[str, _Loop | None] = {}
@@ -192,7 +229,11 @@ def _loop_of(
 
 
 def _key_of(dynamics: Any, integrator: CLoop) -> str:
-    """Return a digest of all that a path depends on, anew where a tensor has changed."""
+    """Return a digest of all that a path depends on, anew where a tensor has changed.
+
+    Raises:
+        Exception: if the model cannot be pickled.
+    """
     tensors = [*dynamics.parameters(), *dynamics.buffers()]
     versions = [id(dynamics), *((x.data_ptr(), x._version) for x in tensors)]
     known, key = _KEYS.get(integrator, (None, ""))
@@ -218,7 +259,7 @@ def _compared(
         return loop
 
     if known is not None:
-        with suppress(AssertionError):  # a class has changed since
+        with suppress(AssertionError):  # a function that the class uses has changed since
             return loop_by(*known)
     new = _traced(dynamics, x, u, h)
     loop = loop_by(*new)

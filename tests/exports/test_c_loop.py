@@ -1,6 +1,8 @@
 """Rollouts as loops in C, beside the loop in Python."""
 
+import importlib
 import logging
+import sys
 from collections import Counter
 from functools import partial
 
@@ -150,6 +152,42 @@ def test_a_compiled_loop_serves_the_next_process(monkeypatch, cached):
     c_library._target.cache_clear()  # as for another processor
     monkeypatch.setattr(c_library, "_FLAGS", [*c_library._FLAGS, "-mtune=generic"])
     assert next_process(monkeypatch) is None
+
+
+SPRING = """
+from pinn_dyn.testing import LinearSystem
+
+class Spring(LinearSystem):
+    def _potential_force(self, q):
+        return super()._potential_force(q) + {force} * (q > 0.5)
+"""
+
+
+def test_a_class_that_has_changed_gets_a_loop_of_its_own(monkeypatch, tmp_path):
+    """The change acts beyond the first step only. A class without a file gets no loop."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    for force in (0.0, -9.5):
+        (tmp_path / "springs_of_a_user.py").write_text(SPRING.format(force=force))
+        sys.modules.pop("springs_of_a_user", None)
+        module = importlib.import_module("springs_of_a_user")
+        c_loop._LOOPS.clear()
+        c_loop._WITHOUT.clear()
+        model = module.Spring([[1.0]], [[2.0]], [[0.1]], [[1.0]])
+        t = 0.01 * torch.arange(100).double()
+        start = torch.tensor([0.3, 2.0]).double()
+        signal = Signal(t, torch.zeros(100, 1).double())
+        with torch.no_grad():
+            found = model_for_rollouts(model).predict(start, t, signal)
+            expected = model.double().predict(start, t, signal)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+        assert expected[:, 0].max() > 0.6
+        assert isinstance(*c_loop._LOOPS.values(), c_loop._Loop)
+    monkeypatch.delattr(module, "__file__")
+    c_loop._origin.cache_clear()
+    copy = model_for_rollouts(model)
+    with pytest.raises(TypeError, match="has no file"):
+        c_loop._key_of(copy, copy.integrator)
 
 
 def test_code_of_an_earlier_class_is_replaced(monkeypatch, cached):
