@@ -16,6 +16,7 @@ from pinn_dyn.data.logs import (
     RowClock,
 )
 from pinn_dyn.data.logs.checks import _are_ticks
+from pinn_dyn.data.logs.registers import rows_before_first_sample
 from tests.data.logs_files import motion, source, write
 
 RESAMPLE = {"resample": Resample(rate=100.0, max_gap=0.2)}
@@ -136,6 +137,13 @@ def test_zeros_before_the_first_sample_are_left_out(tmp_path, count, named):
     assert len(log.load().train[0].t) == 601 - count
     assert any(f"q jumps after the first {count} rows" in x for x in log.warnings) == named
     assert len(log.warnings) == named
+
+
+@pytest.mark.parametrize(("count", "left_out"), [(5, 5), (20, 0)])
+def test_a_long_rest_before_a_jump_is_a_motion(count, left_out):
+    q = 5.0 + np.sin(0.1 * np.arange(100))[:, None]
+    q[:count] = 0.0
+    assert rows_before_first_sample(q) == left_out
 
 
 def gaps(rng, bursts):
