@@ -131,6 +131,14 @@ def shifted(offset):
     return change
 
 
+def noisy(table):
+    """Torques with slow noise that no equation explains."""
+    rng, mean = np.random.default_rng(0), np.ones(21) / 21**0.5
+    for name in ("u1", "u2", "u3"):
+        noise = np.convolve(rng.normal(size=len(table) + 20), mean, "valid")
+        table[name] += 0.3 * table[name].std() * noise
+
+
 def findings(frames, structure=None, unit="Nm"):
     """Texts of the check that are not ok, by the name of their measurement, and the check."""
     columns = next(iter(frames.values())).columns
@@ -235,6 +243,7 @@ CLEAN = {
     "currents": (lambda: edited(times(0.2, "u1", "u3")), None, "A"),
     "masses wrong": (arm_runs, masses_wrong, "Nm"),
     "geared": (lambda: arm_runs(armature=0.3, dry=4.0), lambda: RigidChain(arm().urdf(0)), "Nm"),
+    "noisy torques": (lambda: edited(noisy), lambda: RigidChain(arm().urdf(0)), "Nm"),
     "sticks and rests": (lambda: recorded(coarse), None, "Nm"),
     "tendons": (lambda: recorded(tendons), None, "rad"),
     "pendulum": (lambda: {f"run{k}": pendulum(k) for k in range(RUNS)}, None, "1"),
