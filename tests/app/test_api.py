@@ -398,6 +398,8 @@ def test_a_finished_run_is_loaded_only_for_the_same_data_and_arguments(tmp_path)
     assert trained().metrics == first.metrics
     with pytest.raises(ValueError, match=r"seed=1 \(there 0\): train into another folder") as error:
         trained(seed=1)
+    with pytest.raises(ValueError, match=r"start_from=\S+ \(there None\)"):
+        trained(start_from=first)
     with pytest.raises(ValueError, match=r"(?s)still has changed .*train has other") as error:
         trained(2.0)
     assert pinn_dyn.load(tmp_path).source.load().train[0].v[1] == pytest.approx(0.01)
