@@ -120,7 +120,8 @@ class LogCheck:
             first = items[0]
             more = ", ".join(x.place for x in items[1:] if x.place) or f"{len(items) - 1} more"
             also = f" The same: {more}." if len(items) > 1 else ""
-            texts.append(f"{first.verdict}: {first.text}.{also} ({first.section})")
+            end = "" if first.text.endswith("?") else "."
+            texts.append(f"{first.verdict}: {first.text}{end}{also} ({first.section})")
         return texts
 
     def __str__(self) -> str:
