@@ -6,7 +6,7 @@ import contextlib
 import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -103,7 +103,10 @@ STEPS, LOG_STEPS = 20_000, 1000
 """Default steps of the optimizer on simulated data and on a log."""
 _PAIRS, _BATCH = 10_000, 128  # at most, of a log
 _WINDOW, _STEP = 2, 0.02  # steps of a training window of a log, and their length in s
-_FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs for least squares, and steps for it and subnet
+_FEW_PAIRS, _LONG_WINDOW = (
+    150,
+    10,
+)  # pairs for least squares, and steps for it, subnet and oscillators
 _HISTORY = 0.5  # s of the past, for subnet
 _COLUMNS = [
     "name",
@@ -226,23 +229,6 @@ def train(
         config = _description(source, model, model_name, parts) | settings
     config = merged(with_structures(config), {"model": changes} if changes else {})
     run_folder = Path(folder).expanduser()
-    job = _Job(
-        folder=run_folder,
-        source=source,
-        model=model,
-        parts=parts,
-        config=config,
-        seed=seed,
-        ensemble=ensemble,
-        steps=steps,
-        validations=validations,
-        compile=compile,
-        trainer=trainer,
-        callbacks=callbacks,
-        loggers=loggers,
-        start_from=start_from,
-        keeps_data=made_in_python and temporary is None,
-    )
     try:
         with contextlib.ExitStack() as stack:
             stack.callback(torch.set_num_threads, torch.get_num_threads())
@@ -254,7 +240,28 @@ def train(
                 _same_data(source, run_folder, saved)
                 log.info("already trained: %s is loaded; overwrite=True trains again", run_folder)
             else:
-                job.run(checkpoint, saved)
+                if checkpoint is not None:
+                    log.info("resuming in %s from step %d", run_folder, saved["global_step"])
+                # A missing compiler or device is refused before data are simulated.
+                parts |= dict(config=config, compile=compiles(compile, steps, trainer))
+                parts["clipping"] = {key: trainer[key] for key in CLIPPING if key in trainer}
+                if callbacks is None:
+                    callbacks = [RolloutFigures(every_n_validations=4)]
+                if loggers is None:
+                    loggers = [tensorboard(run_folder)]
+                length = epochs(steps, validations)
+                loop = build_trainer(run_folder, trainer, callbacks, loggers, length)
+                identity = _same_data(source, run_folder, saved)
+                if made_in_python and temporary is None:
+                    store(source, run_folder / TRAJECTORIES)
+                if isinstance(source, LogSource):
+                    write_whole(run_folder / "log_report.md", source.report)
+                L.seed_everything(seed, verbose=False)
+                windows = build_data(parts.pop("data"), source, seed, length[1])
+                learner = _learner(model, windows, loop.world_size, seed, ensemble, parts)
+                if start_from is not None:
+                    _start_from(start_from, learner, new=checkpoint is None)
+                _fit(loop, learner, windows, identity, checkpoint, run_folder)
     except KeyboardInterrupt:
         way = f"the same call resumes it from {run_folder}" + " without overwrite" * overwrite
         if temporary is not None:
@@ -267,54 +274,6 @@ def train(
     builder = (lambda statistics: copy.deepcopy(model)) if isinstance(model, Predictor) else model
     run = load_run(run_folder, "best", trust=None, model=builder)
     return replace(run, _made_in_python=source if made_in_python else None, _temporary=temporary)
-
-
-@dataclass(kw_only=True)
-class _Job:
-    """A training with its defaults filled in, see :func:`train`; ``parts`` are its builders."""
-
-    folder: Path
-    source: DataSource
-    model: ModelBuilder | Predictor
-    parts: dict[str, Any]
-    config: dict[str, Any]
-    seed: int
-    ensemble: int
-    steps: int
-    validations: int
-    compile: bool | Literal["auto"]
-    trainer: Mapping[str, Any]
-    callbacks: Sequence[L.Callback] | None
-    loggers: Sequence[Logger] | None
-    start_from: Run | None
-    keeps_data: bool
-
-    def run(self, checkpoint: Path | None, saved: Mapping[str, Any]) -> None:
-        """Train, from a checkpoint and its content if there is one."""
-        if checkpoint is not None:
-            log.info("resuming in %s from step %d", self.folder, saved["global_step"])
-        # A missing compiler or device is refused before data are simulated.
-        parts = self.parts | dict(
-            config=self.config,
-            compile=compiles(self.compile, self.steps, self.trainer),
-            clipping={key: self.trainer[key] for key in CLIPPING if key in self.trainer},
-        )
-        figures = [RolloutFigures(every_n_validations=4)]
-        callbacks = figures if self.callbacks is None else self.callbacks
-        loggers = [tensorboard(self.folder)] if self.loggers is None else self.loggers
-        length = epochs(self.steps, self.validations)
-        loop = build_trainer(self.folder, self.trainer, callbacks, loggers, length)
-        identity = _same_data(self.source, self.folder, saved)
-        if self.keeps_data:
-            store(self.source, self.folder / TRAJECTORIES)
-        if isinstance(self.source, LogSource):
-            write_whole(self.folder / "log_report.md", self.source.report)
-        L.seed_everything(self.seed, verbose=False)
-        windows = build_data(parts.pop("data"), self.source, self.seed, length[1])
-        learner = _learner(self.model, windows, loop.world_size, self.seed, self.ensemble, parts)
-        if self.start_from is not None:
-            _start_from(self.start_from, learner, new=checkpoint is None)
-        _fit(loop, learner, windows, identity, checkpoint, self.folder)
 
 
 def _by_name(kind: str, value: Any, names: Mapping[str, Any]) -> Any:
@@ -337,9 +296,9 @@ def _windows(source: DataSource, model: Any, optimizer: Any) -> Callable[..., Dy
     pairs, steps = (_FEW_PAIRS, _LONG_WINDOW) if few else (_PAIRS, _WINDOW)
     batch = min(_BATCH, pairs)
     windows = partial(DynamicsData, pairs=pairs, steps=steps, stride=stride, batch_size=batch)
-    if model in ("subnet", "oscillators"):
-        return partial(windows, history=_HISTORY * (model == "subnet"), steps=_LONG_WINDOW)
-    return windows
+    if model == "subnet":
+        return partial(windows, history=_HISTORY, steps=_LONG_WINDOW)
+    return partial(windows, steps=_LONG_WINDOW) if model == "oscillators" else windows
 
 
 def _same_data(source: DataSource, folder: Path, saved: Mapping[str, Any]) -> dict[str, Any]:

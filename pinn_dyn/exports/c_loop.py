@@ -209,7 +209,7 @@ def _loop_of(
     """Return the loop of a model, or None where it does not pay off yet or is not possible."""
     try:
         key = _key_of(dynamics, integrator)
-    except Exception:  # from a class of the user
+    except Exception:  # from a class that cannot be pickled, or without a file
         log.debug("no loop in C for %s", type(dynamics).__name__, exc_info=True)
         return None
     if key not in _LOOPS:
@@ -229,11 +229,7 @@ def _loop_of(
 
 
 def _key_of(dynamics: Any, integrator: CLoop) -> str:
-    """Return a digest of all that a path depends on, anew where a tensor has changed.
-
-    Raises:
-        Exception: if the model cannot be pickled.
-    """
+    """Return a digest of all that a path depends on, anew where a tensor has changed."""
     tensors = [*dynamics.parameters(), *dynamics.buffers()]
     versions = [id(dynamics), *((x.data_ptr(), x._version) for x in tensors)]
     known, key = _KEYS.get(integrator, (None, ""))
@@ -248,7 +244,7 @@ def _key_of(dynamics: Any, integrator: CLoop) -> str:
 def _compared(
     key: str, known: tuple[str, Tensor] | None, dynamics: Any, x: Tensor, u: Tensor, h: Tensor
 ) -> _Loop:
-    """Return a loop whose first step is that of the model, by code that is known already or new."""
+    """Return a loop whose first step is that of the model, by known code or by new code."""
     zero = torch.zeros_like(x)
     expected = dynamics.integration_step(zero, x, u, h)
 
