@@ -126,6 +126,8 @@ def _shares(
             results.append(np.ones(count))
             continue
         explained = force_columns(rows, i, rigid)
+        if rigid is not None:  # a spring beside gravity is no limit of a drive
+            explained["spring"] = rows.q[:, [i]]
         y = rows.u[:, 0, i * count : (i + 1) * count]
         y = y - y.mean(axis=0)
         regression = EquationOfMotionRegression({**explained, "u": y}, np.zeros(len(y), dtype=int))
