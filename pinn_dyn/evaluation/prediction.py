@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from pinn_dyn.ensembles import Ensemble
@@ -122,14 +123,16 @@ def predict_trajectories(
     return Prediction(t, paths.mean(0), q, members, v_hat, v_true)
 
 
-def model_for_rollouts(model: Model, device: torch.device | str = "cpu") -> Model:
+def model_for_rollouts(
+    model: Model, device: torch.device | str = "cpu", threads: PositiveInt = 1
+) -> Model:
     """Copy the model in float64, with loops in C (on a GPU recorded steps) for long rollouts."""
     copy = double_copy(model, device)
     members, inner = (1, copy.stack) if isinstance(copy, Ensemble) else (0, copy)
     if isinstance(inner, ContinuousPredictor) and torch.device(device).type == "cuda":
         inner.integrator = RecordedSteps(inner.integrator)
     elif isinstance(inner, ContinuousPredictor):
-        inner.integrator = CLoop(inner.integrator, members)
+        inner.integrator = CLoop(inner.integrator, members, threads)
     return copy
 
 

@@ -14,6 +14,8 @@ from pinn_dyn.exports.program import Program, operation, unsupported
 PRELUDE = """\
 #include <tgmath.h>
 
+typedef int flag;
+#define choose(mask, a, b) ((mask) ? (a) : (b))
 static inline real square(real x) { return x * x; }
 static inline real larger(real a, real b) { return a > b || a != a ? a : b; }
 static inline real smaller(real a, real b) { return a < b || a != a ? a : b; }
@@ -24,28 +26,27 @@ static inline real sigmoid(real x) { return 1 / (1 + exp(-x)); }
 
 _FUNCTIONS = "sqrt exp expm1 log log1p sin cos tan asin acos atan sinh cosh tanh erf floor sigmoid"
 _OPERATORS = {"mul": "*", "div": "/", "add": "+", "sub": "-", "gt": ">", "ge": ">=", "lt": "<"}
-_OPERATORS |= {"le": "<=", "eq": "==", "logical_and": "&&", "logical_or": "||"}
-_ELEMENTWISE = {
+_OPERATORS |= {"le": "<=", "eq": "==", "logical_and": "&", "logical_or": "|"}
+ELEMENTWISE = {
     **{name: f"{name}({{0}})" for name in [*_FUNCTIONS.split(), "sign"]},
     **{name: f"{{0}} {sign} {{1}}" for name, sign in _OPERATORS.items()},
     **{name: f"{name}({{0}}, {{1}})" for name in ("atan2", "pow", "fmod")},
     "neg": "-{0}",
     "reciprocal": "1 / {0}",
     "abs": "fabs({0})",
-    "logical_not": "!{0}",
+    "logical_not": "{0} == 0",
     "clone": "{0}",
     "copy": "{1}",
     "_to_copy": "{0}",
     "maximum": "larger({0}, {1})",
     "minimum": "smaller({0}, {1})",
-    "where": "{0} ? {1} : {2}",
+    "where": "choose({0}, {1}, {2})",
 }
-_REDUCTIONS = {
+REDUCTIONS = {
     "sum": ("0", "{0} + {1}"),
     "amin": ("INFINITY", "smaller({0}, {1})"),
     "amax": ("-INFINITY", "larger({0}, {1})"),
 }
-_ROWS, _COLUMNS = 32, 4  # of a matrix product that are summed at once
 Index = Sequence[str]
 
 
@@ -54,7 +55,14 @@ class Constants:
 
     Args:
         real: type of the numbers, ``double`` or ``float``.
+
+    Attributes:
+        block: rows and columns of a matrix product that are summed at once.
+        arguments: names that the functions of the file hand on to each other.
     """
+
+    block = 32, 4
+    arguments: tuple[str, ...] = ()
 
     def __init__(self, real: str):
         self.real = real
@@ -77,6 +85,15 @@ class Constants:
         text = text if math.isfinite(value) else "INFINITY"
         return f"(-{text})" if value < 0 else text
 
+    def elements(self, values: Tensor) -> list[float | str]:
+        """Return the numbers of an array, as expressions where they may be other ones."""
+        numbers: list[float | str] = values.tolist()
+        return numbers
+
+    def spread(self, text: str) -> str:
+        """Return an expression as a ``real``, which it may not be if it depends on no input."""
+        return text
+
     def definitions(self) -> list[str]:
         """Return the lines that define the arrays."""
         return [
@@ -87,6 +104,17 @@ class Constants:
     def _definition(self, kind: str, name: str, values: Tensor) -> str:
         numbers = ", ".join(self.number(x) for x in values.tolist())
         return f"static const {kind} {name}[{len(values)}] = {{{numbers}}};"
+
+
+def is_mask_as_number(node: fx.Node, k: int) -> bool:
+    """Return true if operand k is a truth value, and the result of the operation is not."""
+    source = node.args[k]
+    return (
+        isinstance(source, fx.Node)
+        and source.meta["val"].dtype == torch.bool
+        and node.meta["val"].dtype != torch.bool
+        and (operation(node), k) != ("where", 0)
+    )
 
 
 class _Buffers:
@@ -163,12 +191,12 @@ class CFunction:
         self.stack = 2 * arrays + 1024
 
     def _has_one_use(self, node: fx.Node) -> bool:
-        if operation(node) not in _ELEMENTWISE or len(node.users) != 1:
+        if operation(node) not in ELEMENTWISE or len(node.users) != 1:
             return False
         (user,) = node.users
-        if operation(user) in _REDUCTIONS:
+        if operation(user) in REDUCTIONS:
             return True
-        same = operation(user) in _ELEMENTWISE
+        same = operation(user) in ELEMENTWISE
         return same and user.meta["val"].numel() == node.meta["val"].numel()
 
     def _reads(self, node: fx.Node) -> list[int]:
@@ -220,11 +248,18 @@ class CFunction:
     def _expression(self, node: fx.Node, index: Index) -> str:
         name, arguments = operation(node), node.args
         operands = [
-            self._operand(x, index) for x in arguments if isinstance(x, fx.Node | int | float)
+            self._number(node, k, index)
+            for k, x in enumerate(arguments)
+            if isinstance(x, fx.Node | int | float)
         ]
         if name == "pow" and arguments[1] in (2, 0.5):
             return f"{'square' if arguments[1] == 2 else 'sqrt'}({operands[0]})"
-        return _ELEMENTWISE[name].format(*operands)
+        return ELEMENTWISE[name].format(*operands)
+
+    def _number(self, node: fx.Node, k: int, index: Index) -> str:
+        """Return an operand of an elementwise operation, with true as 1 where it is a number."""
+        text = self._operand(node.args[k], index)
+        return f"choose({text}, 1, 0)" if is_mask_as_number(node, k) else text
 
     # Statements.
 
@@ -249,11 +284,12 @@ class CFunction:
         """Write a loop that copies a source."""
         if value.numel():
             index, sizes = self._indices(value)
-            self._loops(sizes, [f"{self._element(value, index)} = {self._operand(source, index)};"])
+            operand = self.constants.spread(self._operand(source, index))
+            self._loops(sizes, [f"{self._element(value, index)} = {operand};"])
 
     def _declare(self, node: fx.Node) -> Tensor:
         value: Tensor = node.meta["val"]
-        kind = "int" if value.dtype == torch.bool else "real"
+        kind = "flag" if value.dtype == torch.bool else "real"
         size = value.untyped_storage().nbytes() // value.element_size()
         self._arrays[_storage(value)] = self._buffers.take(kind, size)
         return value
@@ -262,12 +298,14 @@ class CFunction:
         value, name = node.meta["val"], operation(node)
         if not isinstance(value, Tensor) or not value.numel() or _storage(value) in self._arrays:
             return  # of several results, of no numbers, or a view
-        if name in _ELEMENTWISE:
+        if name in ELEMENTWISE:
             index, sizes = self._indices(self._declare(node))
             expression = self._expression(node, index)
+            if value.dtype != torch.bool:
+                expression = self.constants.spread(expression)
             self._loops(sizes, [f"{self._element(value, index)} = {expression};"])
             return
-        write: Any = self._reduction if name in _REDUCTIONS else getattr(self, f"_{name}", None)
+        write: Any = self._reduction if name in REDUCTIONS else getattr(self, f"_{name}", None)
         if write is None:
             raise unsupported(node, "C code")
         write(node, *node.args)
@@ -278,18 +316,19 @@ class CFunction:
         a, b = left.meta["val"], right.meta["val"]
         if left.op != "get_attr" and right.op == "get_attr":  # (B^T A^T)^T
             a, b, out, weights = b.mT, a.mT, out.mT, right
-        constant = weights.op == "get_attr"
+        constant, zero = weights.op == "get_attr", self.constants.spread("0")
         (rows, depth), columns = a.shape, b.shape[1]
-        full = rows - rows % _ROWS
-        for first, end, width in ((0, full, _ROWS), (full, rows, rows - full)):
+        height, breadth = self.constants.block
+        full = rows - rows % height
+        for first, end, width in ((0, full, height), (full, rows, rows - full)):
             if first == end:
                 continue
             block = a[first:end].unflatten(0, (-1, width)).transpose(1, 2)
             weight = self._element(block, ["b", "k", "i"], constant)  # constants in this order
             target = out[first:end].unflatten(0, (-1, width))
             row = f"for (int i = 0; i < {width}; i++)"
-            for start in range(0, columns, _COLUMNS):
-                numbers = range(start, min(start + _COLUMNS, columns))
+            for start in range(0, columns, breadth):
+                numbers = range(start, min(start + breadth, columns))
                 factors = [f"y{j} = {self._element(b, ['k', str(j)])}" for j in numbers]
                 sums = [f"s{j}[i] += {weight} * y{j};" for j in numbers]
                 copies = [
@@ -297,7 +336,7 @@ class CFunction:
                 ]
                 body = [
                     f"real {', '.join(f's{j}[{width}]' for j in numbers)};",
-                    f"{row} {' = '.join(f's{j}[i]' for j in numbers)} = 0;",
+                    f"{row} {' = '.join(f's{j}[i]' for j in numbers)} = {zero};",
                     f"for (int k = 0; k < {depth}; k++) {{",
                     f"  const real {', '.join(factors)};",
                     f"  {row} {{ {' '.join(sums)} }}",
@@ -306,17 +345,17 @@ class CFunction:
                 ]
                 self._loops({"b": len(block)}, body)
 
-    def _state_derivative(self, node: fx.Node, *sources: fx.Node) -> None:
-        """Write a call of the function with this name."""
+    def _call(self, node: fx.Node, name: str, size: int, sources: Sequence[fx.Node]) -> None:
         values = [*(source.meta["val"] for source in sources), self._declare(node)]
         pointers = [f"&{self._element(value, ['0'])}" for value in values]
-        self.lines.append(f"state_derivative(values, {', '.join(pointers)});")
+        self.lines.append(f"{name}({', '.join([*self.constants.arguments, *pointers])});")
 
     def _reduction(self, node: fx.Node, source: fx.Node, dims: Any = None, keep: bool = False):
-        start, step = _REDUCTIONS[operation(node)]
+        start, step = REDUCTIONS[operation(node)]
+        start = self.constants.spread(start)
         value, shape = self._declare(node), source.meta["val"].shape
         if not shape.numel():  # such as the force of no inputs
-            self._assign(value, float(start))
+            self._assign(value, 0.0)
             return
         dims = [d % len(shape) for d in dims] if dims else [*range(len(shape))]
         index, sizes = self._indices(value)

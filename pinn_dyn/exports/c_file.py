@@ -16,9 +16,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pinn_dyn.exports.c_code import PRELUDE, CFunction, Constants
+from pinn_dyn.exports.c_code import PRELUDE, Constants
 from pinn_dyn.exports.escaping import c_text
 from pinn_dyn.exports.exported import Calls, ExportedFunction, Real, identifier
+from pinn_dyn.exports.program import Program
+from pinn_dyn.exports.scalar_code import CBody, c_function
 
 log = logging.getLogger(__name__)
 
@@ -45,13 +47,25 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     """
     name = identifier(path.stem)
     constants = Constants(real)
-    bodies = [CFunction(function.program, constants) for function in functions]
+    called: dict[str, tuple[Program, CBody]] = {}
+    programs, bodies = [], []
+    for function in functions:
+        parts = function.programs()
+        programs.append(parts.pop(function.name))
+        bodies.append(c_function(programs[-1], constants))
+        called |= {x: (p, c_function(p, constants)) for x, p in parts.items()}
     code = [f"typedef {real} real;", PRELUDE, *constants.definitions()]
-    declarations = []
-    for function, body in zip(functions, bodies, strict=True):
-        signature = _signature(function, name, real)
+    for inner, (program, body) in called.items():
+        names = [*(f"const real *{x}" for x in program.inputs), "real *result"]
+        unused = [f"(void){x};" for x in program.inputs]
+        code += [f"\nstatic void {inner}({', '.join(names)})"]
+        code += ["{", *(f"  {line}" for line in [*unused, *body.lines]), "}"]
+    declarations, deepest = [], max((body.stack for _, body in called.values()), default=0)
+    for function, program, body in zip(functions, programs, bodies, strict=True):
+        stack = body.stack + deepest * function.calls
+        signature = _signature(function.name, program, name, real)
         declarations += [
-            f"/* {function.about} Stack: at most {body.stack} bytes. */".replace("/*  ", "/* "),
+            f"/* {function.about} Stack: at most {stack} bytes. */".replace("/*  ", "/* "),
             f"{signature};",
         ]
         unused = [f"(void){x};" for x in function.inputs]
@@ -83,14 +97,14 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     path.with_suffix(".h").write_text("\n".join([*header, ""]))
     about = f"const char *{name}_info(void) {{ return {name}_INFO; }}"
     path.write_text("\n".join([f'#include "{path.stem}.h"', *code, "", about, ""]))
-    program = _compiled(path, [_loop(function, name, real) for function in functions])
-    if program is None:
+    named = {function.name: x for function, x in zip(functions, programs, strict=True)}
+    compiled = _compiled(path, [_loop(x, program, name, real) for x, program in named.items()])
+    if compiled is None:
         return {}
-    return {function.name: _call(program, function, real) for function in functions}
+    return {x: _call(compiled, x, program, real) for x, program in named.items()}
 
 
-def _signature(function: ExportedFunction, name: str, real: Real) -> str:
-    program = function.program
+def _signature(function: str, program: Program, name: str, real: Real) -> str:
     parameters = [
         f"const {real} {x}[{shape.numel()}]" if len(shape) else f"{real} {x}"
         for x, shape in program.inputs.items()
@@ -98,7 +112,7 @@ def _signature(function: ExportedFunction, name: str, real: Real) -> str:
     results = {x: n for x, n in program.outputs.items() if x != STATUS}
     parameters += [f"{real} {x}[{shape.numel()}]" for x, shape in results.items()]
     kind = "int" if STATUS in program.outputs else "void"
-    return f"{kind} {name}_{function.name}({', '.join(parameters)})"
+    return f"{kind} {name}_{function}({', '.join(parameters)})"
 
 
 def find_compiler() -> list[str] | None:
@@ -151,15 +165,15 @@ def _compiled(path: Path, loops: Sequence[str]) -> Path | None:
     return compile_c(compiler, flags, path, "\n".join(main))
 
 
-def _loop(function: ExportedFunction, name: str, real: Real) -> str:
+def _loop(function: str, program: Program, name: str, real: Real) -> str:
     """Return C code that calls a function for the states of the standard input."""
-    shapes = function.program.inputs, function.program.outputs
+    shapes = program.inputs, program.outputs
     x, y = _pointers("x", shapes[0]), _pointers("y", shapes[1])
     arguments = [pointer if len(shapes[0][key]) else f"*{pointer}" for key, pointer in x.items()]
     status = y.pop(STATUS, None)
-    call = f"{name}_{function.name}({', '.join([*arguments, *y.values()])})"
+    call = f"{name}_{function}({', '.join([*arguments, *y.values()])})"
     return _LOOP.format(
-        function=function.name,
+        function=function,
         real=real,
         inputs=sum(map(torch.Size.numel, shapes[0].values())),
         outputs=sum(map(torch.Size.numel, shapes[1].values())),
@@ -174,14 +188,14 @@ def _pointers(array: str, shapes: Mapping[str, torch.Size]) -> dict[str, str]:
 
 
 def _call(
-    program: Path, function: ExportedFunction, real: Real
+    path: Path, function: str, program: Program, real: Real
 ) -> Callable[..., Sequence[np.ndarray]]:
     dtype = np.float64 if real == "double" else np.float32
-    ends = [*accumulate(map(torch.Size.numel, function.program.outputs.values()))]
+    ends = [*accumulate(map(torch.Size.numel, program.outputs.values()))]
 
     def call(*inputs: np.ndarray) -> Sequence[np.ndarray]:
         states = np.concatenate([x.reshape(len(x), -1) for x in inputs], axis=1, dtype=dtype)
-        command = [str(program), function.name]
+        command = [str(path), function]
         try:
             result = subprocess.run(
                 command,
@@ -191,7 +205,7 @@ def _call(
                 check=True,
             )
         except (OSError, subprocess.SubprocessError) as error:
-            raise RuntimeError(f"{function.name} cannot be compared: {error}") from error
+            raise RuntimeError(f"{function} cannot be compared: {error}") from error
         values = np.frombuffer(result.stdout, dtype).reshape(len(states), -1)
         return np.split(values, ends[:-1], axis=1)
 

@@ -16,9 +16,10 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import Tensor
 
-from pinn_dyn.exports.c_code import PRELUDE, CFunction, Constants
+from pinn_dyn.exports.c_code import PRELUDE, Constants
 from pinn_dyn.exports.c_file import compile_c, find_compiler
 from pinn_dyn.exports.program import trace
+from pinn_dyn.exports.scalar_code import c_function
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[
     try:
         program = trace(function, {"x": x}, ["y"])
         constants = Constants("double")
-        lines = CFunction(program, constants).lines
+        lines = c_function(program, constants).lines
         (n,), (m,) = x.shape, function(x).shape
         code = ["typedef double real;", PRELUDE, *constants.definitions()]
         code += ["static void row(const real *restrict x, real *restrict y)", "{", *lines, "}"]

@@ -9,19 +9,22 @@ import logging
 import pickle
 import sys
 from collections import Counter
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
-from pinn_dyn.exports.c_code import PRELUDE, CFunction, Constants
+from pinn_dyn.exports.c_code import PRELUDE, Constants
 from pinn_dyn.exports.c_file import find_compiler
+from pinn_dyn.exports.c_lanes import LOOP, ONE, SEVERAL
 from pinn_dyn.exports.c_library import QUICK, load_code, recall, remember
-from pinn_dyn.exports.program import trace
+from pinn_dyn.exports.program import Program, calling_part, trace
+from pinn_dyn.exports.scalar_code import c_function
 from pinn_dyn.mechanics.compilation import Wrapped
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator
 from pinn_dyn.mechanics.signal import Signal
@@ -35,15 +38,8 @@ TRAJECTORIES = 100
 """Number of trajectories with which a step in Python takes twice as long as with one."""
 NUMBERS = 2**21
 """Number of inputs that are computed at once, to limit the memory of large batches."""
-_LOOP = """
-void roll_out(real *values, long count, long steps, real *start, real *inputs, real *lengths,
-              real *path)
-{{
-  for (long b = 0; b < count; b++, start += {size}, path += {size})
-    for (long k = 0; k < steps; k++, path += {size}, inputs += {stages})
-      integration_step(values, path, start, inputs, lengths[k], path + {size});
-}}
-"""
+SEVERAL_FROM = 4
+"""Number of trajectories from which they are computed side by side in vectors."""
 
 
 class CLoop(Wrapped):
@@ -57,11 +53,12 @@ class CLoop(Wrapped):
     Args:
         inner: the method.
         members: number of leading dimensions of the state for members: 1 for an ensemble, or 0.
+        threads: number of threads that share the trajectories.
     """
 
-    def __init__(self, inner: Integrator, members: int = 0):
+    def __init__(self, inner: Integrator, members: int = 0, threads: PositiveInt = 1):
         super().__init__(inner)
-        self.members = members
+        self.members, self.threads = members, threads
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         if not start.numel():
@@ -79,7 +76,7 @@ class CLoop(Wrapped):
         for inputs, lengths in self.blocks(grid, signal, steps):
             rows = inputs.reshape(*inputs.shape[: 2 + self.members], len(x), -1)
             rows = rows.movedim(2 + self.members, 0)
-            blocks.append(loop(blocks[-1][:, -1], x, rows, lengths))
+            blocks.append(loop(blocks[-1][:, -1], x, rows, lengths, self.threads))
         path = torch.cat(blocks, dim=1).movedim(0, 1 + self.members)
         return path.reshape(-1, *leading, *batch, start.shape[-1])
 
@@ -93,62 +90,97 @@ class _Loop:
     """
 
     def __init__(self, code: str, values: Tensor):
-        self._function, self._values = load_code(code, QUICK).roll_out, values
+        self._library, self._values = load_code(code, QUICK), values
 
-    def __call__(self, increment: Tensor, start: Tensor, inputs: Tensor, lengths: Tensor) -> Tensor:
+    def __call__(
+        self,
+        increment: Tensor,
+        start: Tensor,
+        inputs: Tensor,
+        lengths: Tensor,
+        threads: int = 1,
+    ) -> Tensor:
         """Return the increments after the steps, ``(B, T, ...)``, of B trajectories."""
         path = start.new_empty(len(start), len(lengths) + 1, *start.shape[1:])
         path[:, 0] = increment
-        arrays = [self._values, start, inputs.contiguous(), lengths.contiguous(), path]
-        values, *pointers = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
-        self._function(values, ctypes.c_long(len(start)), ctypes.c_long(len(lengths)), *pointers)
+        inputs, lengths = inputs.contiguous(), lengths.contiguous()
+
+        def roll_out(part: slice) -> None:
+            rows = start[part], inputs[part], lengths, path[part]
+            pointers = [ctypes.c_void_p(x.data_ptr()) for x in (self._values, *rows)]
+            sizes = ctypes.c_long(len(rows[0])), ctypes.c_long(len(lengths))
+            self._library.roll_out(pointers[0], *sizes, *pointers[1:])
+
+        size = -(-len(start) // threads)
+        parts = [slice(k, k + size) for k in range(0, len(start), size)]
+        if len(parts) == 1:
+            roll_out(parts[0])
+        else:  # the calls release the interpreter
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(roll_out, parts))
         return path[:, 1:]
 
 
-def _traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> tuple[str, Tensor]:
-    """Return the code of the loop of a model, and the numbers of the model."""
+def _traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> dict[str, Program]:
+    """Return the programs of a step of a model, and of the part that it calls."""
     step = {"increment": torch.zeros_like(x), "start": x, "inputs": inputs, "h": h}
-    programs, derivative = {}, dynamics.state_derivative
-    if x.ndim == 1:
-        rate = {"x": x, "input": inputs[0]}
-        programs["state_derivative"] = trace(derivative, rate, ["rate"], lines=False)
-        dynamics.state_derivative = lambda *values: _rate(*(y.contiguous() for y in values))
-    try:
-        function = dynamics.integration_step
-        programs["integration_step"] = trace(function, step, ["end"], lines=False)
-    finally:
-        vars(dynamics).pop("state_derivative", None)
-    constants, code = _Values("double"), []
+    end = functools.partial(trace, dynamics.integration_step, step, ["end"], lines=False)
+    if x.ndim > 1:  # an ensemble
+        return {"integration_step": end()}
+    with calling_part(dynamics, x, inputs[0]) as part:
+        return {"part": part, "integration_step": end()}
+
+
+def _code(programs: dict[str, Program], several: bool) -> tuple[str, Tensor]:
+    """Return the code of the loop of a model, and the numbers of the model."""
+    numbers, functions = _Numbers("double"), []
+    numbers.block = (8, 2) if several else numbers.block
     for name, program in programs.items():
         parameters = ["values", *program.inputs, *program.outputs]
-        text = ", ".join("real h" if x == "h" else f"real *restrict {x}" for x in parameters)
-        lines = CFunction(program, constants).lines
-        code += [f"static void {name}({text})", "{", *lines, "}"]
-    definitions = ["typedef double real;", PRELUDE, *constants.definitions()]
-    loop = _LOOP.format(size=x.numel(), stages=inputs.numel())
-    text = "\n".join([*definitions, *code, loop])
-    return text, torch.cat([*constants.values, x.new_zeros(1)])
+        kinds = {"values": "double *", "h": "double "}
+        text = ", ".join(f"{kinds.get(x, 'real *restrict ')}{x}" for x in parameters)
+        lines = c_function(program, numbers).lines
+        functions += [f"static void {name}({text})", "{", *lines, "}"]
+    shapes = programs["integration_step"].inputs
+    sizes = {"size": shapes["start"].numel(), "stages": shapes["inputs"].numel()}
+    parts = [SEVERAL] if several else [ONE, PRELUDE]
+    parts += ["#define VALUES values", *numbers.definitions(), *functions, LOOP.format(**sizes)]
+    return "\n".join(parts), torch.cat([*numbers.values, torch.zeros(1).double()])
 
 
-@torch.library.custom_op("pinn_dyn::state_derivative", mutates_args=())
-def _rate(x: Tensor, u: Tensor) -> Tensor:
-    """Stand for a call of the state derivative in a program."""
-    return torch.empty_like(x)
-
-
-class _Values(Constants):
+class _Numbers(Constants):
     """Constants that are arguments of the code."""
 
-    def definitions(self) -> list[str]:
+    arguments = ("values",)
+
+    def __init__(self, real: str):
+        super().__init__(real)
         self.values: list[Tensor] = []
-        return super().definitions()
+        self._starts: dict[str, int] = {}
+
+    def name(self, values: Tensor) -> str:
+        name = super().name(values)
+        if values.dtype.is_floating_point and name not in self._starts:
+            self._starts[name] = sum(map(len, self.values))
+            self.values.append(values.flatten())
+        return name
+
+    def elements(self, values: Tensor) -> list[float | str]:
+        if not values.dtype.is_floating_point:
+            return super().elements(values)
+        start = self._starts[self.name(values)]
+        # Zeros and ones follow from the structure. Other numbers may be learned.
+        return [
+            x if abs(x) in (0, 1) else f"VALUES[{start + k}]" for k, x in enumerate(values.tolist())
+        ]
+
+    def spread(self, text: str) -> str:
+        return f"lanes({text})"
 
     def _definition(self, kind: str, name: str, values: Tensor) -> str:
         if kind == "int":
             return super()._definition(kind, name, values)
-        offset = sum(map(len, self.values))
-        self.values.append(values)
-        return f"#define {name} (values + {offset})"
+        return f"#define {name} (VALUES + {self._starts[name]})"
 
 
 class _Content(pickle.Pickler):
@@ -197,6 +229,8 @@ def _state(file: str | Path | None) -> str:
 
 _LOOPS: dict[str, _Loop | None] = {}
 """Loops of this process by the content of their models; None for a model without a loop."""
+_PROGRAMS: dict[str, dict[str, Program]] = {}
+"""Traced models of this process, for loops over one and over several trajectories."""
 _WITHOUT: Counter[str] = Counter()
 """Steps that were taken without a loop."""
 _KEYS: WeakKeyDictionary[CLoop, tuple[list[Any], str]] = WeakKeyDictionary()
@@ -208,10 +242,12 @@ def _loop_of(
 ) -> _Loop | None:
     """Return the loop of a model, or None where it does not pay off yet or is not possible."""
     try:
-        key = _key_of(dynamics, integrator)
+        model = _key_of(dynamics, integrator)
     except Exception:  # from a class that cannot be pickled, or without a file
         log.debug("no loop in C for %s", type(dynamics).__name__, exc_info=True)
         return None
+    several = len(x) >= SEVERAL_FROM
+    key = f"{model}{'s' * several}"
     if key not in _LOOPS:
         steps = (len(grid) - 1) * (1 + len(x) // TRAJECTORIES)
         is_new, _WITHOUT[key] = key not in _WITHOUT, _WITHOUT[key] + steps
@@ -220,9 +256,18 @@ def _loop_of(
             return None
         if len(_LOOPS) >= _MOST_LOOPS:
             _LOOPS.clear()
+            _PROGRAMS.clear()
         _LOOPS[key] = None
         try:
-            _LOOPS[key] = _compared(key, known, dynamics, x[0], u[:, 0], grid[1] - grid[0])
+            example = x[0], u[:, 0], grid[1] - grid[0]
+            loop = None if known is None else _checked(*known, dynamics, *example)
+            if loop is None:
+                _PROGRAMS[model] = _PROGRAMS.get(model) or _traced(dynamics, *example)
+                new = _code(_PROGRAMS[model], several)
+                loop = _checked(*new, dynamics, *example)
+                if loop is not None:
+                    remember(key, *new)
+            _LOOPS[key] = loop
         except Exception:  # from a head that cannot be traced, a compiler or a full disk
             log.debug("no loop in C for %s", type(dynamics).__name__, exc_info=True)
     return _LOOPS[key]
@@ -235,29 +280,18 @@ def _key_of(dynamics: Any, integrator: CLoop) -> str:
     known, key = _KEYS.get(integrator, (None, ""))
     if known != versions:
         content = BytesIO()
-        _Content(content).dump((dynamics, integrator))
+        _Content(content).dump((dynamics, integrator.inner))
         key = hashlib.sha256(content.getvalue()).hexdigest()
         _KEYS[integrator] = versions, key
     return key
 
 
-def _compared(
-    key: str, known: tuple[str, Tensor] | None, dynamics: Any, x: Tensor, u: Tensor, h: Tensor
-) -> _Loop:
-    """Return a loop whose first step is that of the model, by known code or by new code."""
-    zero = torch.zeros_like(x)
+def _checked(
+    code: str, values: Tensor, dynamics: Any, x: Tensor, u: Tensor, h: Tensor
+) -> _Loop | None:
+    """Return a loop if its first step is that of the model."""
+    zero, loop = torch.zeros_like(x), _Loop(code, values)
     expected = dynamics.integration_step(zero, x, u, h)
-
-    def loop_by(code: str, values: Tensor) -> _Loop:
-        loop = _Loop(code, values)
-        step = loop(zero[None], x[None], u[None, None], h[None])[0, 0]
-        torch.testing.assert_close(step, expected, rtol=1e-9, atol=1e-12, equal_nan=True)
-        return loop
-
-    if known is not None:
-        with suppress(AssertionError):  # a function that the class uses has changed since
-            return loop_by(*known)
-    new = _traced(dynamics, x, u, h)
-    loop = loop_by(*new)
-    remember(key, *new)
-    return loop
+    step = loop(zero[None], x[None], u[None, None], h[None])[0, 0]
+    is_equal = torch.allclose(step, expected, rtol=1e-9, atol=1e-12, equal_nan=True)
+    return loop if is_equal else None

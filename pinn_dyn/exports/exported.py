@@ -18,6 +18,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from pinn_dyn.exports.program import Program
+    from pinn_dyn.mechanics import ContinuousPredictor
 
 Real = Literal["double", "float"]
 Call = Callable[..., Sequence[np.ndarray]]
@@ -47,6 +48,7 @@ class ExportedFunction:
         inputs: values of each input by name, ``(200, *shape)``, float64.
         outputs: names of the outputs.
         about: units and meaning, for the file.
+        model: the model of which the function calls a part several times, or None.
     """
 
     def __init__(
@@ -56,8 +58,10 @@ class ExportedFunction:
         inputs: Mapping[str, Tensor],
         outputs: Sequence[str],
         about: str = "",
+        model: ContinuousPredictor | None = None,
     ):
         self.name, self.function, self.about = name, function, about
+        self._model, self.calls = model, model is not None
         self.inputs, self.outputs = dict(inputs), list(outputs)
 
     @cached_property
@@ -67,6 +71,17 @@ class ExportedFunction:
 
         example = {name: values[0] for name, values in self.inputs.items()}
         return trace(self.function, example, self.outputs)
+
+    def programs(self) -> dict[str, Program]:
+        """Return the operations by name, first those of the part of the model that it calls."""
+        from pinn_dyn.exports.program import calling_part, trace
+
+        if self._model is None:
+            return {self.name: self.program}
+        n, m = self._model.num_coordinates, self._model.num_inputs
+        example = {name: values[0] for name, values in self.inputs.items()}
+        with calling_part(self._model, *torch.zeros(2 * n + m).double().split([2 * n, m])) as part:
+            return {"part": part, self.name: trace(self.function, example, self.outputs)}
 
     def compare(self, call: Call, tolerance: float) -> None:
         """Compare with a function of the file.

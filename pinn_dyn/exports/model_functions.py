@@ -46,7 +46,8 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
         names = [x for x in inputs.split() if sizes[x] != 0]
         results = [x for x in outputs.split() if x != "A" or m]
         values = {x: states[x] for x in names}
-        return ExportedFunction(function.__name__, of_present_inputs, values, results, about)
+        calls = model if isinstance(model, ContinuousPredictor) and function is step else None
+        return ExportedFunction(function.__name__, of_present_inputs, values, results, about, calls)
 
     def forward_dynamics(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         assert isinstance(model, ContinuousPredictor)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.exports.decompositions import DECOMPOSITIONS
+from pinn_dyn.mechanics.integrators import Sticking
 
 MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
 MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias detach copy"
@@ -124,6 +126,47 @@ def trace(
     results = module(*values)
     shapes = {name: value.shape for name, value in zip(outputs, results, strict=True)}
     return Program(module, {name: value.shape for name, value in inputs.items()}, shapes)
+
+
+@torch.library.custom_op("pinn_dyn::call", mutates_args=())
+def _call(name: str, size: int, arguments: list[Tensor]) -> Tensor:
+    """Stand for a call of a function with one result in a program."""
+    return arguments[0].new_ones(size)
+
+
+@contextmanager
+def calling_part(model: Any, state: Tensor, u: Tensor) -> Iterator[Program]:
+    """Let programs call the part of a model that the stages of a step share, within a context.
+
+    It is the mass matrix and the bias force of a system with sticking friction, in one array, or
+    the state derivative of another model.
+
+    Args:
+        model: a continuous predictor.
+        state, u: example of a state ``(S,)`` and an input ``(M,)``.
+    """
+    is_sticking = isinstance(model.integrator, Sticking)
+    name = "_mass_and_bias" if is_sticking else "state_derivative"
+    original, n = getattr(model, name), len(state) // 2
+    inputs = {"x": state[:n], "y": state[n:]} if is_sticking else {"x": state, "y": u}
+
+    def part(x: Tensor, y: Tensor) -> Tensor:
+        if not is_sticking:
+            return original(x, y)
+        mass, bias = original(x, y)
+        return torch.cat([mass.flatten(), bias])
+
+    def replacement(x: Tensor, y: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        size = n * (n + 1) if is_sticking else 2 * n
+        result = _call("part", size, [x.contiguous(), y.contiguous()])
+        return (result[: n * n].reshape(n, n), result[n * n :]) if is_sticking else result
+
+    program = trace(part, inputs, ["result"], lines=False)
+    setattr(model, name, replacement)
+    try:
+        yield program
+    finally:
+        vars(model).pop(name, None)
 
 
 class _Values(fx.Interpreter):

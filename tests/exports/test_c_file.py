@@ -11,7 +11,7 @@ import torch
 
 from pinn_dyn.app.export import export
 from pinn_dyn.exports import exported
-from pinn_dyn.exports.c_code import Constants
+from pinn_dyn.exports.c_code import ELEMENTWISE, Constants
 from pinn_dyn.exports.exported import ExportedFunction, write
 from pinn_dyn.exports.model_functions import model_functions
 from tests.exports.test_formats import CONSTANT, MODELS
@@ -72,13 +72,12 @@ SINE = ExportedFunction("sine", torch.sin, {"x": torch.linspace(-1, 1, 200).doub
 
 
 def test_code_that_computes_something_else_leaves_no_file(tmp_path, monkeypatch):
-    table = {"sin": "cos({0})"}
-    monkeypatch.setattr("pinn_dyn.exports.c_code._ELEMENTWISE", table)
+    monkeypatch.setitem(ELEMENTWISE, "sin", "cos({0})")
     assert_refused(tmp_path, r"sine: y differs from the original by .* at x = \[")
 
 
 def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
-    monkeypatch.setattr("pinn_dyn.exports.c_code._ELEMENTWISE", {"sin": "{0} +* 1"})
+    monkeypatch.setitem(ELEMENTWISE, "sin", "{0} +* 1")
     assert_refused(tmp_path, r"cc does not compile f\.c: .*error")
 
 
@@ -86,7 +85,7 @@ def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
     ("code", "end"), [("{0}; for (;;)", "timed out"), ("*(volatile real *)0 * {0}", "SIGSEGV")]
 )
 def test_code_that_does_not_return_ends_with_a_message(tmp_path, monkeypatch, code, end):
-    monkeypatch.setattr("pinn_dyn.exports.c_code._ELEMENTWISE", {"sin": code})
+    monkeypatch.setitem(ELEMENTWISE, "sin", code)
     monkeypatch.setattr("pinn_dyn.exports.c_file.TIME_LIMIT", 0.5)
     assert_refused(tmp_path, rf"sine cannot be compared: .*{end}")
 

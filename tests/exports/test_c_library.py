@@ -60,7 +60,9 @@ def rebuilt(monkeypatch):
 
 @pytest.mark.parametrize("content", [b"", None, b"\x7fELF of others"])
 def test_a_damaged_library_is_built_again(library, monkeypatch, content):
-    library.write_bytes(library.read_bytes()[:4096] if content is None else content)
+    content = library.read_bytes()[:4096] if content is None else content
+    library.unlink()  # this process has mapped the file
+    library.write_bytes(content)
     assert rebuilt(monkeypatch)
     monkeypatch.undo()
     assert len(library.read_bytes()) > 4096
