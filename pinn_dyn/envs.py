@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.app.run import Run
@@ -17,6 +18,8 @@ from pinn_dyn.app.run_folder import load
 from pinn_dyn.control import DataRegion, Plant, SystemPlant
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation.prediction import model_for_rollouts
+from pinn_dyn.exports.c_draws import LoopOfDraws
+from pinn_dyn.exports.c_loop import CLoop, Loop
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.rollout import path_between
 
@@ -28,6 +31,10 @@ except ImportError as error:
 
 Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
 """Reward of a step, from q and v after it, ``(N,)`` each, and the input ``(M,)``."""
+Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Rewards of K robots ``(K,)``, from q and v after a step, ``(K, N)`` each, and u ``(K, M)``."""
+
+log = logging.getLogger(__name__)
 
 _SAMPLES = 200  # states per trajectory
 
@@ -35,39 +42,158 @@ _SAMPLES = 200  # states per trajectory
 class ModelPlant(Plant):
     """K copies of a learned robot, integrated as in its training; inputs are zero before the start.
 
+    A loop in C is used from the start of the motion after which it pays off, see
+    :class:`~pinn_dyn.exports.c_loop.CLoop`.
+
     Args:
         model: the learned system.
         step: longest step of the integration, s.
         delay: time between an input and its action, ``(M,)``, s; None for none.
+        draws: models of the same class with other constants: copy k is draw ``k % len(draws)``.
+            None for copies of the model.
+        threads: number of threads that share the copies.
     """
 
     def __init__(
-        self, model: MechanicalSystem, *, step: PositiveFloat, delay: Tensor | None = None
+        self,
+        model: MechanicalSystem,
+        *,
+        step: PositiveFloat,
+        delay: Tensor | None = None,
+        draws: Sequence[MechanicalSystem] | None = None,
+        threads: PositiveInt = 1,
     ):
         self.num_coordinates, self.num_inputs = model.num_coordinates, model.num_inputs
-        self._model, self._step = model, step
+        self._models = [model_for_rollouts(x) for x in draws or [model]]
+        self._model, self._step, self._threads = self._models[0], step, threads
         self._delay = torch.zeros(model.num_inputs) if delay is None else delay
+        self._loop: Loop | None = None
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
-        p0 = v0 if self._model.state == "qv" else self._model.momentum(q0, v0)
-        self._x = torch.cat([q0, p0], dim=-1)
+        self._x = self._states(q0, v0, torch.ones(len(q0)).bool())
         self._inputs = [q0.new_zeros(len(q0), self.num_inputs)]
+        if len(self._models) == 1:
+            integrator = cast(CLoop, self._model.integrator)
+            self._loop = integrator.ready(self._model, self._x, self._step)
+        elif self._loop is None:
+            self._loop = self._loop_of_draws()
+
+    def restart(self, chosen: Tensor, q0: Tensor, v0: Tensor) -> None:
+        """Put the chosen copies ``(K,)`` into new states ``(k, N)``, with inputs of zero before."""
+        self._x = self._x.clone()
+        self._x[chosen] = self._states(q0, v0, chosen)
+        self._inputs = [torch.where(chosen[:, None], 0.0, u) for u in self._inputs]
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        model = self._model
         longest = max(self._delay.tolist(), default=0.0)
         self._inputs = [*self._inputs, u][-(math.ceil(longest / duration) + 1) :]
+        count = math.ceil(duration / self._step - 1e-6)
+        if self._loop is None or longest > 0:
+            self._x = self._x + self._path(duration, count)
+        else:
+            stages = len(self._model.integrator.nodes)
+            inputs = u[:, None, None].expand(-1, count, stages, -1)
+            lengths = self._x.new_full((count,), duration / count)
+            zero = torch.zeros_like(self._x)
+            self._x = self._x + self._loop(zero, self._x, inputs, lengths, self._threads)[:, -1]
+        return self._motion()
+
+    def _path(self, duration: float, count: int) -> Tensor:
+        """Return the increments ``(K, 2N)`` after the last inputs."""
         starts = duration * torch.arange(1 - len(self._inputs), 1, dtype=torch.float64)
         signal = Signal(starts, torch.stack(self._inputs, dim=1), "hold").delayed(self._delay)
         # Steps of the integration end where a delayed input changes.
-        count = math.ceil(duration / self._step - 1e-6)
         times = torch.linspace(0.0, duration, count + 1, dtype=torch.float64)
         times = torch.cat([times, signal.t.clamp(0.0, duration)]).unique()
+        increments = torch.empty_like(self._x)
         with torch.no_grad():
-            path = path_between(model, model.integrator, self._x, times, signal)
-            self._x = self._x + path[:, -1]
-            q, v = self._x.chunk(2, dim=-1)
-            return q, v if model.state == "qv" else model.velocity(q, v)
+            for rows, model in self._copies():
+                part = signal.with_samples(signal.u[rows])
+                path = path_between(model, model.integrator, self._x[rows], times, part)
+                increments[rows] = path[:, -1]
+        return increments
+
+    def _copies(self) -> list[tuple[slice, MechanicalSystem]]:
+        count = len(self._models)
+        return [(slice(k, None, count), x) for k, x in enumerate(self._models[: len(self._x)])]
+
+    def _states(self, q: Tensor, v: Tensor, chosen: Tensor) -> Tensor:
+        """Return the states ``(k, 2N)`` of the chosen copies."""
+        if self._model.state == "qv":
+            return torch.cat([q, v], dim=-1)
+        owner = torch.arange(len(chosen))[chosen] % len(self._models)
+        p = torch.empty_like(v)
+        for k, model in enumerate(self._models):
+            p[owner == k] = model.momentum(q[owner == k], v[owner == k])
+        return torch.cat([q, p], dim=-1)
+
+    def _motion(self) -> tuple[Tensor, Tensor]:
+        q, v = self._x.chunk(2, dim=-1)
+        if self._model.state == "qp":
+            p, v = v, torch.empty_like(v)
+            with torch.no_grad():
+                for rows, model in self._copies():
+                    v[rows] = model.velocity(q[rows], p[rows])
+        return q, v
+
+    def _loop_of_draws(self) -> Loop | None:
+        stages, h = len(self._model.integrator.nodes), self._x.new_tensor(self._step)
+        inputs = self._x.new_zeros(stages, self.num_inputs)
+        try:
+            return LoopOfDraws(self._models, len(self._x), self._x[0], inputs, h)
+        except Exception:  # from a head that cannot be traced, a compiler or a full disk
+            log.info("no loop in C for draws of %s", type(self._model).__name__, exc_info=True)
+            return None
+
+
+class _Task:
+    """The robot, the data and the limits of an environment, see :class:`RobotEnv`."""
+
+    def __init__(
+        self,
+        robot: Run | MechanicalSystem | Plant | str | Path,
+        data: Run | DataSource | None,
+        step: float | None,
+        limits: tuple[Sequence[float] | None, Sequence[float] | None],
+        draws: Sequence[MechanicalSystem] | None = None,
+        threads: int = 1,
+    ):
+        robot = load(robot) if isinstance(robot, (str, Path)) else robot
+        data = robot if data is None and isinstance(robot, Run) else data
+        if data is None:
+            raise TypeError("a robot that is not a run needs training data: set data")
+        source = data.source if isinstance(data, Run) else data
+        train = source.load().train
+        sample_time = float(train[0].t[1] - train[0].t[0])
+        self.dt = step or (data.statistics.step if isinstance(data, Run) else sample_time)
+        if isinstance(robot, Run):
+            robot = ModelPlant(
+                robot.system,
+                step=robot.statistics.step,
+                delay=torch.from_numpy(robot.input_delay),
+                draws=draws,
+                threads=threads,
+            )
+        elif isinstance(robot, MechanicalSystem):
+            robot = SystemPlant(double_copy(robot))
+        self.plant: Plant = robot
+        q, v = (
+            [x[:: max(1, len(x) // _SAMPLES)].double() for x in values]
+            for values in ([item.q for item in train], [item.v for item in train])
+        )
+        self.region = DataRegion(q, v, angles=source.angles)
+        self.q, self.v, u = torch.cat(q), torch.cat(v), torch.cat([item.u for item in train])
+        ends = [
+            u.amin(0) if limits[0] is None else limits[0],
+            u.amax(0) if limits[1] is None else limits[1],
+        ]
+        low, high = (np.asarray(limit, dtype=np.float32) for limit in ends)
+        self.inputs = gymnasium.spaces.Box(low, high)
+
+    def observations(self, has_goal: bool) -> gymnasium.spaces.Box:
+        """Return the space of (q, v), with a goal or without."""
+        size = self.q.shape[1] * (3 if has_goal else 2)
+        return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
 
 class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -110,32 +236,11 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         u_low: Sequence[float] | None = None,
         u_high: Sequence[float] | None = None,
     ):
-        robot = load(robot) if isinstance(robot, (str, Path)) else robot
-        data = robot if data is None and isinstance(robot, Run) else data
-        if data is None:
-            raise TypeError("a robot that is not a run needs training data: set data")
-        source = data.source if isinstance(data, Run) else data
-        train = source.load().train
-        sample_time = float(train[0].t[1] - train[0].t[0])
-        self.dt = step or (data.statistics.step if isinstance(data, Run) else sample_time)
-        if isinstance(robot, Run):
-            delay, step_of_training = torch.from_numpy(robot.input_delay), robot.statistics.step
-            robot = ModelPlant(model_for_rollouts(robot.system), step=step_of_training, delay=delay)
-        elif isinstance(robot, MechanicalSystem):
-            robot = SystemPlant(double_copy(robot))
-        self.plant = robot
+        task = _Task(robot, data, step, (u_low, u_high))
+        self.plant, self.dt, self.region = task.plant, task.dt, task.region
         self.reward, self.steps = reward, max(1, round(duration / self.dt))
-        q, v = (
-            [x[:: max(1, len(x) // _SAMPLES)].double() for x in values]
-            for values in ([item.q for item in train], [item.v for item in train])
-        )
-        self.region = DataRegion(q, v, angles=source.angles)
-        self._q, self._v, u = torch.cat(q), torch.cat(v), torch.cat([item.u for item in train])
-        limits = u.amin(0) if u_low is None else u_low, u.amax(0) if u_high is None else u_high
-        low, high = (np.asarray(limit, dtype=np.float32) for limit in limits)
-        self.action_space = gymnasium.spaces.Box(low, high)
-        size = self._q.shape[1] * (3 if reward is None else 2)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
+        self._q, self._v, self.action_space = task.q, task.v, task.inputs
+        self.observation_space = task.observations(has_goal=reward is None)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -170,6 +275,112 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _info(self) -> dict[str, Any]:
         return {"distance": float(self.region.distance(*self._state))}
+
+
+class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    r"""K robots that are integrated side by side, with the interface of Gymnasium.
+
+    Each robot is a :class:`RobotEnv`, with the same observations, rewards and ends. Episodes end at
+    different times, and a robot starts a new one in the step after its last
+    (``AutoresetMode.NEXT_STEP``). ``distances()`` returns the distances from the training data.
+
+    Args:
+        robot: a run or its folder, a mechanical system, or a plant of K robots.
+        num_envs: K.
+        data, step, duration, u_low, u_high: see :class:`RobotEnv`.
+        reward: rewards of a step for arrays of K robots; None for the distance to a goal.
+        draws: models with other constants, as ``run.sample`` returns them: robot k is draw
+            ``k % len(draws)``. They need a run. None for K copies of the model.
+        threads: number of threads that share the robots of a run.
+
+    Raises:
+        TypeError: if the model is not a mechanical system, ``data`` is missing, or ``draws`` are
+            given without a run.
+    """
+
+    def __init__(
+        self,
+        robot: Run | MechanicalSystem | Plant | str | Path,
+        num_envs: PositiveInt,
+        *,
+        data: Run | DataSource | None = None,
+        reward: Rewards | None = None,
+        step: PositiveFloat | None = None,
+        duration: PositiveFloat = 5.0,
+        u_low: Sequence[float] | None = None,
+        u_high: Sequence[float] | None = None,
+        draws: Sequence[MechanicalSystem] | None = None,
+        threads: PositiveInt = 1,
+    ):
+        task = _Task(robot, data, step, (u_low, u_high), draws, threads)
+        if not isinstance(task.plant, ModelPlant):
+            raise TypeError("a vector of robots needs a run: use gymnasium.make_vec for others")
+        self.num_envs, self.plant, self.dt, self.region = num_envs, task.plant, task.dt, task.region
+        self.reward, self.steps = reward, max(1, round(duration / self.dt))
+        self._starts = task.q.numpy(), task.v.numpy()
+        self.single_action_space = self._inputs = task.inputs
+        self.single_observation_space = task.observations(has_goal=reward is None)
+        self.action_space = gymnasium.vector.utils.batch_space(task.inputs, num_envs)
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, num_envs
+        )
+        self.metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode of each robot in a drawn state of the training data."""
+        super().reset(seed=seed)
+        self._q, self._v, self._goal = self._drawn(self.num_envs)
+        self.plant.start(torch.from_numpy(self._q), torch.from_numpy(self._v))
+        self._count = np.zeros(self.num_envs, dtype=int)
+        self._is_over = np.zeros(self.num_envs, dtype=bool)
+        return self._observations(), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Hold inputs ``(K, M)``, clipped to their limits, for one step."""
+        ended = self._is_over
+        u = np.clip(actions, self._inputs.low, self._inputs.high).astype(float)
+        q, v = (x.numpy() for x in self.plant.advance(torch.from_numpy(u), self.dt))
+        diverged = ~(np.isfinite(q).all(1) & np.isfinite(v).all(1)) & ~ended
+        self._q, self._v = (
+            np.where(diverged[:, None], before, after)
+            for before, after in ((self._q, q), (self._v, v))
+        )
+        self._count += 1
+        if self.reward is None:
+            rewards = -np.square(self._q - self._goal).sum(1)
+        else:
+            rewards = self.reward(self._q, self._v, u)
+        rewards = np.where(diverged, rewards * (self.steps - self._count + 1), rewards)
+        if ended.any():
+            rewards = np.where(ended, 0.0, rewards)
+            self._restart(ended)
+        truncated = self._count >= self.steps
+        self._is_over = diverged | truncated
+        return self._observations(), rewards, diverged, truncated, {}
+
+    def distances(self) -> np.ndarray:
+        """Return the distances ``(K,)`` of the states from the training data, 1 at the edge."""
+        return self.region.distance(torch.from_numpy(self._q), torch.from_numpy(self._v)).numpy()
+
+    def _restart(self, ended: np.ndarray) -> None:
+        self._q[ended], self._v[ended], self._goal[ended] = self._drawn(int(ended.sum()))
+        starts = (torch.from_numpy(x[ended]) for x in (self._q, self._v))
+        self.plant.restart(torch.from_numpy(ended), *starts)
+        self._count[ended] = 0
+
+    def _drawn(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return q, v and goals ``(count, N)`` of the training data."""
+        q, v = self._starts
+        start, goal = self.np_random.integers(len(q), size=(2, count))
+        return q[start], v[start], q[goal]
+
+    def _observations(self) -> np.ndarray:
+        parts = [self._q, self._v, self._goal] if self.reward is None else [self._q, self._v]
+        return np.concatenate(parts, axis=1)
 
 
 gymnasium.register("pinn_dyn/Robot-v0", entry_point="pinn_dyn.envs:RobotEnv")

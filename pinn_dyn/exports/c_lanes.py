@@ -75,6 +75,8 @@ static void unpack(double *to, const real *from, long stride, long size, long co
       to[l * stride + i] = LANE(from[i], l);
 }}
 
+int number_of_lanes(void) {{ return LANES; }}
+
 /* The increments of path (count, steps + 1, {size}) after the first. */
 void roll_out(double *values, long count, long steps, const double *start, const double *inputs,
               const double *lengths, double *path)
@@ -87,7 +89,7 @@ void roll_out(double *values, long count, long steps, const double *start, const
     pack(increment, now, width, {size}, count - b);
     for (long k = 0; k < steps; k++) {{
       pack(u, inputs + b * length + k * {stages}, length, {stages}, count - b);
-      integration_step(values, increment, x, u, lengths[k], next);
+      integration_step({values}, increment, x, u, lengths[k], next);
       memcpy(increment, next, sizeof next);
       now += {size};
       unpack(now, increment, width, {size}, count - b);

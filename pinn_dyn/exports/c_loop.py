@@ -27,6 +27,7 @@ from pinn_dyn.exports.program import Program, calling_part, trace
 from pinn_dyn.exports.scalar_code import c_function
 from pinn_dyn.mechanics.compilation import Wrapped
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator
+from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
 
 log = logging.getLogger(__name__)
@@ -60,6 +61,14 @@ class CLoop(Wrapped):
         super().__init__(inner)
         self.members, self.threads = members, threads
 
+    def ready(self, dynamics: ContinuousPredictor, x: Tensor, h: float) -> Loop | None:
+        """Return the loop for paths from states x ``(B, S)`` with steps of h s, if there is one.
+
+        It stays the loop of the present numbers of the model.
+        """
+        u = x.new_zeros(len(self.nodes), 1, dynamics.num_inputs)
+        return _loop_of(dynamics, self, x, u, x.new_tensor([0.0, h]))
+
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         if not start.numel():
             return self.inner.path(dynamics, start, grid, signal)
@@ -81,7 +90,7 @@ class CLoop(Wrapped):
         return path.reshape(-1, *leading, *batch, start.shape[-1])
 
 
-class _Loop:
+class Loop:
     """Compiled loop of a model over the steps of one trajectory after another.
 
     Args:
@@ -91,6 +100,10 @@ class _Loop:
 
     def __init__(self, code: str, values: Tensor):
         self._library, self._values = load_code(code, QUICK), values
+
+    def _values_of(self, part: slice) -> Tensor:
+        """Return the numbers of a part of the trajectories, which starts with a vector of them."""
+        return self._values
 
     def __call__(
         self,
@@ -107,11 +120,12 @@ class _Loop:
 
         def roll_out(part: slice) -> None:
             rows = start[part], inputs[part], lengths, path[part]
-            pointers = [ctypes.c_void_p(x.data_ptr()) for x in (self._values, *rows)]
+            pointers = [ctypes.c_void_p(x.data_ptr()) for x in (self._values_of(part), *rows)]
             sizes = ctypes.c_long(len(rows[0])), ctypes.c_long(len(lengths))
             self._library.roll_out(pointers[0], *sizes, *pointers[1:])
 
-        size = -(-len(start) // threads)
+        lanes: int = self._library.number_of_lanes()
+        size = -(-len(start) // (threads * lanes)) * lanes
         parts = [slice(k, k + size) for k in range(0, len(start), size)]
         if len(parts) == 1:
             roll_out(parts[0])
@@ -121,7 +135,7 @@ class _Loop:
         return path[:, 1:]
 
 
-def _traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> dict[str, Program]:
+def traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> dict[str, Program]:
     """Return the programs of a step of a model, and of the part that it calls."""
     step = {"increment": torch.zeros_like(x), "start": x, "inputs": inputs, "h": h}
     end = functools.partial(trace, dynamics.integration_step, step, ["end"], lines=False)
@@ -131,9 +145,15 @@ def _traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> dict[str, Pr
         return {"part": part, "integration_step": end()}
 
 
-def _code(programs: dict[str, Program], several: bool) -> tuple[str, Tensor]:
-    """Return the code of the loop of a model, and the numbers of the model."""
-    numbers, functions = _Numbers("double"), []
+def loop_code(
+    programs: dict[str, Program], several: bool, numbers: Numbers | None = None
+) -> tuple[str, Tensor]:
+    """Return the code of the loop of a model, and the numbers of the model.
+
+    ``several`` is true for trajectories side by side. ``numbers`` may be those of each trajectory.
+    """
+    numbers = numbers or Numbers("double")
+    functions = []
     numbers.block = (8, 2) if several else numbers.block
     for name, program in programs.items():
         parameters = ["values", *program.inputs, *program.outputs]
@@ -141,17 +161,25 @@ def _code(programs: dict[str, Program], several: bool) -> tuple[str, Tensor]:
         text = ", ".join(f"{kinds.get(x, 'real *restrict ')}{x}" for x in parameters)
         lines = c_function(program, numbers).lines
         functions += [f"static void {name}({text})", "{", *lines, "}"]
+    values = torch.cat([*numbers.values, numbers.padding()], dim=-1)
     shapes = programs["integration_step"].inputs
     sizes = {"size": shapes["start"].numel(), "stages": shapes["inputs"].numel()}
+    loop = LOOP.format(values=numbers.address.format(values.shape[-1]), **sizes)
     parts = [SEVERAL] if several else [ONE, PRELUDE]
-    parts += ["#define VALUES values", *numbers.definitions(), *functions, LOOP.format(**sizes)]
-    return "\n".join(parts), torch.cat([*numbers.values, torch.zeros(1).double()])
+    parts += [f"#define VALUES {numbers.read}", *numbers.definitions(), *functions, loop]
+    return "\n".join(parts), values
 
 
-class _Numbers(Constants):
-    """Constants that are arguments of the code."""
+class Numbers(Constants):
+    """Constants that are arguments of the code.
+
+    Attributes:
+        read: expression of the array of numbers.
+        address: expression of its start for trajectory b, with a field for its length.
+    """
 
     arguments = ("values",)
+    read, address = "values", "values"
 
     def __init__(self, real: str):
         super().__init__(real)
@@ -173,6 +201,10 @@ class _Numbers(Constants):
         return [
             x if abs(x) in (0, 1) else f"VALUES[{start + k}]" for k, x in enumerate(values.tolist())
         ]
+
+    def padding(self) -> Tensor:
+        """Return a number more, since an array may not be empty."""
+        return torch.zeros(1, dtype=torch.float64)
 
     def spread(self, text: str) -> str:
         return f"lanes({text})"
@@ -227,7 +259,7 @@ def _state(file: str | Path | None) -> str:
     return f"{status.st_size} {status.st_mtime_ns};"
 
 
-_LOOPS: dict[str, _Loop | None] = {}
+_LOOPS: dict[str, Loop | None] = {}
 """Loops of this process by the content of their models; None for a model without a loop."""
 _PROGRAMS: dict[str, dict[str, Program]] = {}
 """Traced models of this process, for loops over one and over several trajectories."""
@@ -239,7 +271,7 @@ _MOST_LOOPS = 64
 
 def _loop_of(
     dynamics: Dynamics, integrator: CLoop, x: Tensor, u: Tensor, grid: Tensor
-) -> _Loop | None:
+) -> Loop | None:
     """Return the loop of a model, or None where it does not pay off yet or is not possible."""
     try:
         model = _key_of(dynamics, integrator)
@@ -262,8 +294,8 @@ def _loop_of(
             example = x[0], u[:, 0], grid[1] - grid[0]
             loop = None if known is None else _checked(*known, dynamics, *example)
             if loop is None:
-                _PROGRAMS[model] = _PROGRAMS.get(model) or _traced(dynamics, *example)
-                new = _code(_PROGRAMS[model], several)
+                _PROGRAMS[model] = _PROGRAMS.get(model) or traced(dynamics, *example)
+                new = loop_code(_PROGRAMS[model], several)
                 loop = _checked(*new, dynamics, *example)
                 if loop is not None:
                     remember(key, *new)
@@ -288,9 +320,9 @@ def _key_of(dynamics: Any, integrator: CLoop) -> str:
 
 def _checked(
     code: str, values: Tensor, dynamics: Any, x: Tensor, u: Tensor, h: Tensor
-) -> _Loop | None:
+) -> Loop | None:
     """Return a loop if its first step is that of the model."""
-    zero, loop = torch.zeros_like(x), _Loop(code, values)
+    zero, loop = torch.zeros_like(x), Loop(code, values)
     expected = dynamics.integration_step(zero, x, u, h)
     step = loop(zero[None], x[None], u[None, None], h[None])[0, 0]
     is_equal = torch.allclose(step, expected, rtol=1e-9, atol=1e-12, equal_nan=True)

@@ -37,6 +37,7 @@ class Program:
     Attributes:
         graph_module: the operations, by name in :data:`torch.ops.aten`.
         inputs, outputs: shape of each input and output by its name, in the order of the function.
+        constants: the evaluation of the stored constants, with the tensors that the function reads.
     """
 
     def __init__(
@@ -44,13 +45,27 @@ class Program:
         graph_module: fx.GraphModule,
         inputs: Mapping[str, torch.Size],
         outputs: Mapping[str, torch.Size],
+        constants: fx.GraphModule,
     ):
-        self.graph_module = graph_module
+        self.graph_module, self.constants = graph_module, constants
         self.inputs, self.outputs = dict(inputs), dict(outputs)
 
     def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
         """Return the outputs in eager PyTorch."""
         return self.graph_module(*arguments)
+
+    def constants_with(self, tensors: Mapping[int, Tensor]) -> dict[str, Tensor]:
+        """Return the constants by the names of their nodes, if the function reads other tensors.
+
+        Args:
+            tensors: the other tensor for the address of the data of a tensor.
+        """
+        read = dict(self.constants.named_buffers()) | dict(self.constants.named_parameters())
+        with torch.no_grad():
+            result: dict[str, Tensor] = torch.func.functional_call(
+                self.constants, {k: tensors.get(x.data_ptr(), x) for k, x in read.items()}, ()
+            )
+        return result
 
     def results(self) -> list[fx.Node]:
         """Return the nodes of the outputs."""
@@ -122,10 +137,11 @@ def trace(
     with tracing(TracingContext(FakeTensorMode())):  # else make_fx creates a mode for every node
         traced = make_fx(torch.func.functionalize(run), table, record_stack_traces=lines)
         module = traced(*values)
-    _fold_constants(module, values)
+    constants = _fold_constants(module, values)
     results = module(*values)
     shapes = {name: value.shape for name, value in zip(outputs, results, strict=True)}
-    return Program(module, {name: value.shape for name, value in inputs.items()}, shapes)
+    sizes = {name: value.shape for name, value in inputs.items()}
+    return Program(module, sizes, shapes, constants)
 
 
 @torch.library.custom_op("pinn_dyn::call", mutates_args=())
@@ -185,7 +201,8 @@ class _Values(fx.Interpreter):
         return value
 
 
-def _fold_constants(module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> None:
+def _fold_constants(module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> fx.GraphModule:
+    """Store the constants of a graph; return their evaluation."""
     graph = module.graph
     for node in graph.nodes:
         if node.target is torch.ops.aten.squeeze_.dim:
@@ -194,6 +211,18 @@ def _fold_constants(module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> No
             graph.erase_node(node)
     graph.eliminate_dead_code()
     _Values(module).run(*arguments)
+    evaluation = fx.Graph(module)
+    copies: dict[fx.Node, fx.Node] = {}
+    for node in graph.nodes:
+        if not node.meta.get("constant"):
+            continue
+        if all(x in copies for x in node.all_input_nodes):
+            copies[node] = evaluation.node_copy(node, copies.__getitem__)
+        else:  # of the shape of an input alone
+            name = f"shaped_{node.name}"
+            module.register_buffer(name, node.meta["val"].detach().clone())
+            copies[node] = evaluation.get_attr(name)
+    stored = {}
     for node in list(graph.nodes):
         if node.op != "call_function" or not node.meta["constant"]:
             continue
@@ -204,6 +233,12 @@ def _fold_constants(module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> No
             with graph.inserting_before(node):
                 replacement = graph.get_attr(name)
             node.replace_all_uses_with(replacement)
+            stored[replacement.name] = copies[node]
+    stored |= {x.name: copies[x] for x in graph.find_nodes(op="get_attr") if x in copies}
     graph.eliminate_dead_code()
+    evaluation.output(stored)
+    evaluation.eliminate_dead_code()
+    constants = fx.GraphModule(module, evaluation)
     module.recompile()
     _Values(module).run(*arguments)
+    return constants

@@ -1,6 +1,7 @@
 """Robots as Gymnasium environments, against predictions of the model and exact solutions."""
 
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,16 +10,19 @@ import torch
 import pinn_dyn
 from pinn_dyn.control import SimulatorPlant
 from pinn_dyn.data import DataSource, Splits
-from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.testing import damped_oscillators, exact_solution
+from pinn_dyn.mechanics import Signal, Trajectory, double_copy
+from pinn_dyn.models import NetworkCholesky
+from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
+from tests.models.builders import VARIANTS, make_structured
 from tests.support.closed_loops import Vanishing
+from tests.support.known import known_model
 from tests.support.simulated_arms import simulated_by
 from tests.support.urdf_by_hand import SPATIAL
 
 gymnasium = pytest.importorskip("gymnasium", reason="the envs extra is not installed")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from pinn_dyn.envs import RobotEnv  # noqa: E402
+from pinn_dyn.envs import ModelPlant, RobotEnv, RobotVectorEnv  # noqa: E402
 
 
 class Recorded(DataSource):
@@ -189,3 +193,102 @@ def test_several_environments_step_together():
 def test_a_robot_without_data_is_told_so():
     with pytest.raises(TypeError, match="set data"):
         RobotEnv(damped_oscillators())
+
+
+def moved(model, factor):
+    model = double_copy(model)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(factor)
+    return model
+
+
+def draws_of(name):
+    """Models of one class with different constants: of networks, or of a chain in C."""
+    if name == "chain":
+        model = known_model().double().eval().requires_grad_(False)
+    else:
+        settings = {**VARIANTS["constant-mass-fixed-damping-constant-input-3x3"]}
+        if name == "wide":  # networks beyond code without loops
+            settings = {"mass": partial(NetworkCholesky, hidden=[32, 32])}
+        model = make_structured({"wide": "lnn"}.get(name, name), **settings)
+        model = model.double().eval().requires_grad_(False)
+    return [moved(model, factor) for factor in (0.0, 0.2, -0.1)]
+
+
+@pytest.mark.parametrize("name", ["chain", "lnn", "hnn", "wide"])
+@pytest.mark.parametrize("delay", [0.0, 0.003])
+def test_robots_with_other_constants_move_as_their_own_models(name, delay):
+    """Seven robots of three models, two of which start again, beside each robot alone."""
+    models = draws_of(name)
+    n, m = models[0].num_coordinates, models[0].num_inputs
+    settings = {"step": 0.005, "delay": torch.full((m,), delay).double()}
+    rng = torch.Generator().manual_seed(1)
+    q, v, u = (torch.rand(3, 7, size, generator=rng).double() - 0.5 for size in (n, n, m))
+    chosen = torch.tensor([False, True, False, False, True, False, False])
+    together = ModelPlant(models[0], draws=models, threads=2, **settings)
+    together.start(q[0], v[0])
+    found = [together.advance(u[0], 0.01)]
+    together.restart(chosen, q[1][chosen], v[1][chosen])
+    found += [together.advance(u[k], 0.01) for k in (1, 2)]
+    assert (together._loop is None) == (name == "wide")
+    for k in range(7):
+        alone = ModelPlant(models[k % 3], **settings)
+        alone.start(q[0, k : k + 1], v[0, k : k + 1])
+        expected = [alone.advance(u[0, k : k + 1], 0.01)]
+        if chosen[k]:
+            alone.start(q[1, k : k + 1], v[1, k : k + 1])
+        expected += [alone.advance(u[j, k : k + 1], 0.01) for j in (1, 2)]
+        for (a, b), (c, d) in zip(found, expected, strict=True):
+            torch.testing.assert_close(a[k], c[0], rtol=0, atol=1e-10)
+            torch.testing.assert_close(b[k], d[0], rtol=0, atol=1e-10)
+
+
+def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
+    """Observations, rewards and ends of robots in a row, also in the episode after the first."""
+    run = pinn_dyn.load(lnn_run)
+    env, single = RobotVectorEnv(run, 3, duration=0.05), RobotEnv(run, duration=0.05)
+    observations, _ = env.reset(seed=0)
+    env.action_space.seed(0)
+    size = observations.shape[1] // 3
+    is_over = np.zeros(3, dtype=bool)
+    single.reset()
+    for _ in range(2 * env.steps + 1):
+        actions, before = env.action_space.sample(), observations
+        observations, rewards, terminated, truncated, _ = env.step(actions)
+        for k in range(3):
+            if is_over[k]:  # the action has no effect, and a new episode starts
+                assert rewards[k] == 0
+                assert (observations[k] != before[k]).any()
+                continue
+            q, v, single._goal = np.split(before[k], 3)
+            single.plant.start(torch.from_numpy(q[None]), torch.from_numpy(v[None]))
+            single._state = (torch.from_numpy(q[None]), torch.from_numpy(v[None]))
+            expected, reward, ended, _, info = single.step(actions[k])
+            np.testing.assert_allclose(observations[k], expected, rtol=0, atol=1e-10)
+            assert rewards[k] == pytest.approx(reward, abs=1e-10)
+            assert terminated[k] == ended
+            assert env.distances()[k] == pytest.approx(info["distance"], abs=1e-8)
+        is_over = terminated | truncated
+    assert size == run.model.num_coordinates
+    assert env.observation_space.contains(observations)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_a_robot_of_a_vector_that_diverges_stays_and_starts_again():
+    model = LinearSystem([[1.0]], [[-1e9]], [[0.0]], [[1.0]])
+    env = RobotVectorEnv(ModelPlant(model, step=0.1), 2, data=Recorded(1, 1), duration=20.0)
+    env.reset(seed=0)
+    count, terminated = 0, np.zeros(2)
+    while not terminated.any():
+        last = env._observations()
+        state, rewards, terminated, _, _ = env.step(np.zeros((2, 1)))
+        count += 1
+    assert terminated.all()
+    np.testing.assert_array_equal(state, last)
+    goal = -np.square(last[:, 0] - last[:, 2])
+    np.testing.assert_allclose(rewards, goal * (env.steps - count + 1))
+    state, rewards, terminated, truncated, _ = env.step(np.zeros((2, 1)))
+    assert not (terminated | truncated).any()
+    assert (np.abs(state[:, :2]) < 2).all()
+    assert not rewards.any()

@@ -78,7 +78,7 @@ def rolled_out(model, batch=(), count=80, interpolation="linear", scale=1.0):
 def test_the_loop_gives_the_states_of_the_model(kind, batch):
     interpolation = {"known": "hold", "rosenbrock": "cubic"}.get(kind, "linear")
     found, expected = rolled_out(MODELS[kind](), batch, interpolation=interpolation)
-    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop._Loop]
+    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop.Loop]
     assert (expected[..., -1, :] - expected[..., 0, :]).abs().max() > 1e-3
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
@@ -161,12 +161,12 @@ def test_a_compiled_loop_serves_the_next_process(monkeypatch, cached):
     monkeypatch.setattr(c_loop, "STEPS", 10**6)
     with monkeypatch.context() as patch:
         patch.setattr(c_loop, "trace", None)
-        assert isinstance(next_process(monkeypatch, count=2), c_loop._Loop)
+        assert isinstance(next_process(monkeypatch, count=2), c_loop.Loop)
     (known,) = cached.glob("compiled/*.pt")
     known.write_bytes(known.read_bytes()[:-1])  # cut short: not read
     assert next_process(monkeypatch) is None
     monkeypatch.setattr(c_loop, "STEPS", 1)
-    assert isinstance(next_process(monkeypatch), c_loop._Loop)
+    assert isinstance(next_process(monkeypatch), c_loop.Loop)
     c_library._target.cache_clear()  # as for another processor
     monkeypatch.setattr(c_library, "_FLAGS", [*c_library._FLAGS, "-mtune=generic"])
     assert next_process(monkeypatch) is None
@@ -200,7 +200,7 @@ def test_a_class_that_has_changed_gets_a_loop_of_its_own(monkeypatch, tmp_path):
             expected = model.double().predict(start, t, signal)
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
         assert expected[:, 0].max() > 0.6
-        assert isinstance(*c_loop._LOOPS.values(), c_loop._Loop)
+        assert isinstance(*c_loop._LOOPS.values(), c_loop.Loop)
     monkeypatch.delattr(module, "__file__")
     c_loop._origin.cache_clear()
     copy = model_for_rollouts(model)
@@ -219,7 +219,7 @@ def test_code_of_an_earlier_class_is_replaced(monkeypatch, cached):
         for path in cached.glob("compiled/*.pt"):
             path.unlink()
         rolled_out(MODELS["momentum"]())  # writes the numbers with wrong code
-    assert isinstance(next_process(monkeypatch), c_loop._Loop)
+    assert isinstance(next_process(monkeypatch), c_loop.Loop)
     (known,) = cached.glob("compiled/*.pt")
     assert "2 * lengths" not in torch.load(known, weights_only=True)[0]
 

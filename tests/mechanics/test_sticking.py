@@ -285,7 +285,7 @@ def test_loops_and_batches_equal_single_steps(monkeypatch, tmp_path):
             with integrated_by(system, wrapper(system.integrator)):
                 path = system.predict(x0, t, both)
             torch.testing.assert_close(path, expected, rtol=0, atol=1e-12)
-    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop._Loop]
+    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop.Loop]
 
 
 @pytest.mark.parametrize("method", METHODS)
