@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import ArrayLike
+from pydantic import PositiveInt
 from torch import Tensor
 
 from pinn_dyn.app.build import build_source
@@ -26,6 +27,7 @@ from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.evaluation.payload import identify_payload
 from pinn_dyn.evaluation.prediction import model_for_rollouts
+from pinn_dyn.exports.c_loop import rows_in_c, versions_of
 from pinn_dyn.exports.exported import Real
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
@@ -198,16 +200,19 @@ class Run:
         return identify_payload(self.model, self.source.load().train, runs, cutoff=cutoff)
 
     @overload
-    def predict(self, start: pd.DataFrame) -> pd.DataFrame: ...
+    def predict(self, start: pd.DataFrame, *, threads: PositiveInt = 1) -> pd.DataFrame: ...
 
     @overload
-    def predict(self, start: Values, u: Values | None, t: Values) -> np.ndarray: ...
+    def predict(
+        self, start: Values, u: Values | None, t: Values, threads: PositiveInt = 1
+    ) -> np.ndarray: ...
 
     def predict(
         self,
         start: pd.DataFrame | Values,
         u: Values | None = None,
         t: Values | None = None,
+        threads: PositiveInt = 1,
     ) -> pd.DataFrame | np.ndarray:
         """Predict the motion from a start under an input, or along a data frame.
 
@@ -224,6 +229,7 @@ class Run:
             start: (q, v), ``(*batch, 2N)``, or (q, p) if ``model.state`` is ``"qp"``; or a frame.
             u: inputs at the times t, ``(*batch, T, M)``; None for a model without inputs.
             t: increasing times, ``(T,)``, s.
+            threads: number of threads that share the motions of a batch.
 
         Raises:
             TypeError: if the input is missing.
@@ -233,10 +239,10 @@ class Run:
             if self.log is None:
                 raise ValueError("the training data have no columns of a log: give start, u and t")
             with torch.no_grad():
-                return predict_frame(self._for_rollouts(), self.log, start)
+                return predict_frame(self._for_rollouts(threads), self.log, start)
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
-            return self._for_rollouts().predict(x0, times, signal).numpy()
+            return self._for_rollouts(threads).predict(x0, times, signal).numpy()
 
     def predict_interval(
         self,
@@ -272,11 +278,13 @@ class Run:
         reach = factor * width * paths.std(dim=0)
         return (mean - reach).numpy(), (mean + reach).numpy()
 
-    def _for_rollouts(self) -> Predictor:
+    def _for_rollouts(self, threads: int = 1) -> Predictor:
         """Return the model with loops in C, copied once for the present weights."""
-        weights = [(x.data_ptr(), x._version) for x in self.model.state_dict().values()]
-        if self._rollouts.get("weights") != weights:
-            self._rollouts.update(weights=weights, model=model_for_rollouts(self.model))
+        state = [threads, *versions_of(self.model)]
+        if self._rollouts.get("state") != state:
+            model = model_for_rollouts(self.model, threads=threads)
+            self._rollouts.clear()
+            self._rollouts.update(state=state, model=model)
         return self._rollouts["model"]
 
     def _motion(
@@ -321,9 +329,25 @@ class Run:
 
     def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
         """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``."""
-        system, (position, velocity) = self.system, self._motion_state(q=q, v=v)
-        force = self._array("u", u, self.model.num_inputs, "M")
-        return system.forward_dynamics(position, velocity, force).numpy()
+        position, velocity = self._motion_state(q=q, v=v)
+        parts = [position, velocity, self._array("u", u, self.model.num_inputs, "M")]
+        batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
+        rows = torch.cat([x.expand(*batch, -1) for x in parts], dim=-1)
+        is_system = isinstance(self.model, MechanicalSystem)
+        model: Any = self._for_rollouts() if is_system else self.system
+        sizes = [x.shape[-1] for x in parts]
+
+        def function(x: Tensor) -> Tensor:
+            acceleration: Tensor = model.forward_dynamics(*x.split(sizes, dim=-1))
+            return acceleration
+
+        compute = self._rollouts.get("forward_dynamics")
+        with torch.no_grad():
+            if compute is None:
+                compute = rows_in_c(model, "forward_dynamics", function, rows)
+            if compute is not function:
+                self._rollouts["forward_dynamics"] = compute
+            return compute(rows).numpy()
 
     def linearize(
         self, q: Values, v: Values, u: Values, *, sample_time: float | None = None

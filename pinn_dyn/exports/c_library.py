@@ -32,7 +32,9 @@ The code has 0.7 to 0.8 of its speed (benchmarks/long_rollout.py)."""
 _MOST_PROGRAMS = 100  # in the cache folder
 
 
-def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[Tensor], Tensor]:
+def compiled_rows(
+    function: Callable[[Tensor], Tensor], x: Tensor, key: str | None = None
+) -> Callable[[Tensor], Tensor]:
     """Return y = f(x) for the rows of float64 tensors, in C.
 
     The function itself is returned if there is no C compiler or no C code for an operation.
@@ -40,19 +42,13 @@ def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[
     Args:
         function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently.
         x: example of a row, ``(n,)``.
+        key: name of the function for :func:`recall` in later processes, or None.
     """
+    known = None if key is None else recall(key)
     try:
-        program = trace(function, {"x": x}, ["y"])
-        constants = Constants("double")
-        lines = c_function(program, constants).lines
-        (n,), (m,) = x.shape, function(x).shape
-        code = ["typedef double real;", PRELUDE, *constants.definitions()]
-        code += ["static void row(const real *restrict x, real *restrict y)", "{", *lines, "}"]
-        code += [
-            "void rows(long count, const real *x, real *y)",
-            f"{{ for (; count > 0; count--, x += {n}, y += {m}) row(x, y); }}",
-        ]
-        library = load_code("\n".join([*code, ""]))
+        code = _code_of_rows(function, x) if known is None else known[0]
+        library = load_code(code, ("-O3",) if key is None else QUICK)
+        (m,) = function(x).shape
 
         def call(values: Tensor) -> Tensor:
             values = values.contiguous()
@@ -62,10 +58,26 @@ def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[
             return result
 
         torch.testing.assert_close(call(x), function(x), rtol=1e-9, atol=1e-12, equal_nan=True)
+        if key is not None and known is None:
+            remember(key, code, torch.zeros(1))
         return call
     except Exception:  # from a head that cannot be traced, a compiler or a full disk
         log.debug("no C code for %s", function, exc_info=True)
         return function
+
+
+def _code_of_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> str:
+    program = trace(function, {"x": x}, ["y"])
+    constants = Constants("double")
+    lines = c_function(program, constants).lines
+    (n,), (m,) = x.shape, function(x).shape
+    code = ["typedef double real;", PRELUDE, *constants.definitions()]
+    code += ["static void row(const real *restrict x, real *restrict y)", "{", *lines, "}"]
+    code += [
+        "void rows(long count, const real *x, real *y)",
+        f"{{ for (; count > 0; count--, x += {n}, y += {m}) row(x, y); }}",
+    ]
+    return "\n".join([*code, ""])
 
 
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:

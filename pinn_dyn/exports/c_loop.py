@@ -9,6 +9,7 @@ import logging
 import pickle
 import sys
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
@@ -17,12 +18,12 @@ from weakref import WeakKeyDictionary
 
 import torch
 from pydantic import PositiveInt
-from torch import Tensor
+from torch import Tensor, nn
 
 from pinn_dyn.exports.c_code import PRELUDE, Constants
 from pinn_dyn.exports.c_file import find_compiler
 from pinn_dyn.exports.c_lanes import LOOP, ONE, SEVERAL
-from pinn_dyn.exports.c_library import QUICK, load_code, recall, remember
+from pinn_dyn.exports.c_library import QUICK, compiled_rows, load_code, recall, remember
 from pinn_dyn.exports.program import Program, calling_part, trace
 from pinn_dyn.exports.scalar_code import c_function
 from pinn_dyn.mechanics.compilation import Wrapped
@@ -263,6 +264,8 @@ _LOOPS: dict[str, Loop | None] = {}
 """Loops of this process by the content of their models; None for a model without a loop."""
 _PROGRAMS: dict[str, dict[str, Program]] = {}
 """Traced models of this process, for loops over one and over several trajectories."""
+_ROWS: dict[str, Callable[[Tensor], Tensor]] = {}
+"""Functions of rows of this process."""
 _WITHOUT: Counter[str] = Counter()
 """Steps that were taken without a loop."""
 _KEYS: WeakKeyDictionary[CLoop, tuple[list[Any], str]] = WeakKeyDictionary()
@@ -305,10 +308,46 @@ def _loop_of(
     return _LOOPS[key]
 
 
+def rows_in_c(
+    model: ContinuousPredictor, name: str, function: Callable[[Tensor], Tensor], rows: Tensor
+) -> Callable[[Tensor], Tensor]:
+    """Return a function of a model for rows, in C if that pays off, see :func:`compiled_rows`.
+
+    Args:
+        model: a model that :class:`CLoop` integrates.
+        name: name of the function.
+        function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently.
+        rows: the next argument of the function, ``(*batch, n)``, float64.
+    """
+    if not isinstance(model.integrator, CLoop) or not rows.numel():
+        return function
+    try:
+        key = f"{_key_of(model, model.integrator)}{name}"
+    except Exception:  # from a class that cannot be pickled, or without a file
+        return function
+    if key not in _ROWS:
+        is_new, count = key not in _WITHOUT, rows.shape[:-1].numel()
+        _WITHOUT[key] += 1 + count // TRAJECTORIES
+        is_worth = _WITHOUT[key] >= STEPS or (is_new and recall(key) is not None)
+        if not is_worth or find_compiler() is None:
+            return function
+        _ROWS[key] = compiled_rows(function, rows.reshape(-1, rows.shape[-1])[0], key)
+    return _ROWS[key]
+
+
+def versions_of(module: nn.Module) -> list[tuple[int, int]]:
+    """Return the address and the version of each tensor of a module."""
+    versions, modules = [], [module]
+    for inner in modules:  # grows meanwhile; module.state_dict() takes ten times as long
+        modules.extend(x for x in inner._modules.values() if x is not None)
+        for table in (inner._parameters, inner._buffers):
+            versions += [(x.data_ptr(), x._version) for x in table.values() if x is not None]
+    return versions
+
+
 def _key_of(dynamics: Any, integrator: CLoop) -> str:
     """Return a digest of all that a path depends on, anew where a tensor has changed."""
-    tensors = [*dynamics.parameters(), *dynamics.buffers()]
-    versions = [id(dynamics), *((x.data_ptr(), x._version) for x in tensors)]
+    versions = [id(dynamics), *versions_of(dynamics)]
     known, key = _KEYS.get(integrator, (None, ""))
     if known != versions:
         content = BytesIO()
