@@ -40,7 +40,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from pinn_dyn.app import build, trainer, training
+from pinn_dyn.app import build, trainer
 from pinn_dyn.app.config import composed
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data import DataSource, Splits
@@ -177,7 +177,7 @@ def run_cell(
     config = configuration(size, batch, loss, optimizer, members, device, compiled)
     L.seed_everything(0, verbose=False)
     data = configured.build_data(config, Sines(size))
-    model = training.build_predictor(
+    model = build.build_predictor(
         build.model_builder(config), data.statistics, 0, config["ensemble"]
     )
     validator = configured.build_validator(config, data.statistics.step)
@@ -289,7 +289,7 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
     trainer.LONGEST_EPOCH, steps = CHECKED, trainer.LONGEST_EPOCH
     data = configured.build_data(config, data.source)
     L.seed_everything(0, verbose=False)
-    model = training.build_predictor(
+    model = build.build_predictor(
         build.model_builder(config), data.statistics, 0, config["ensemble"]
     )
     start = {name: p.detach().clone() for name, p in model.named_parameters()}

@@ -11,6 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 import pinn_dyn
 from pinn_dyn.systems import RigidChain
@@ -60,6 +62,18 @@ def test_a_run_contains_its_structure(fitted, capsys):
     words = [*KNOWN, f"model.structure.urdf={arm}", *SMALL, f"hydra.run.dir={fitted}"]
     text = " ".join(refused_text(capsys, "train.py", *words).split())
     assert re.search(r"another configuration: model.structure.urdf=\S+arm.urdf \w{8} \(there", text)
+
+
+def test_the_errors_and_settings_of_a_fit_are_logged(fitted):
+    record = json.loads((fitted / "metrics.json").read_text())
+    log = EventAccumulator(str(fitted / "tensorboard")).Reload()
+    for name in ("val/error_mean", "val/error_windowed", "train/loss"):
+        (scalar,) = log.Scalars(name)
+        assert (scalar.step, scalar.value) == (0, pytest.approx(record["validation"][name]))
+    content = log.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    start = HParamsPluginData.FromString(content).session_start_info
+    assert start.hparams["model_name"].string_value == "known"
+    assert start.hparams["data.pairs"].number_value == 20
 
 
 def test_what_the_motions_leave_open_is_counted(fitted):

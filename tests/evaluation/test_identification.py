@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.app.constants import write_constants
+from pinn_dyn.app.fit_constants import write_constants
 from pinn_dyn.evaluation.identification import (
     common_factor,
     constants_table,
