@@ -43,7 +43,7 @@ from torch import Tensor
 from pinn_dyn.app import build, trainer
 from pinn_dyn.app.config import composed
 from pinn_dyn.app.provenance import provenance
-from pinn_dyn.data import DataSource, Splits
+from pinn_dyn.data import DataSource, LightningData, Splits
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
@@ -260,7 +260,7 @@ def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Call
         lightning = configured.build_trainer(config, place)
         lightning.callbacks = [*callbacks, *lightning.callbacks]  # type: ignore[attr-defined]
         members = config["ensemble"]
-        lightning.fit(learner, EnsembleData(data, members) if members > 1 else data)
+        lightning.fit(learner, EnsembleData(data, members) if members > 1 else LightningData(data))
 
 
 def schedule(config: dict[str, Any], learner: Any) -> list[float]:

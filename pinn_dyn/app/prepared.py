@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -26,17 +26,14 @@ from pinn_dyn.app.run_folder import (
     in_one_line,
     require_same_data,
 )
-from pinn_dyn.data import DataSource, LogSource, data_identity, store
+from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
-
-if TYPE_CHECKING:
-    from pinn_dyn.data import DynamicsData
-    from pinn_dyn.evaluation import RolloutValidator
 
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""

@@ -22,6 +22,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from pinn_dyn.app.config import ConfigError, naming
 from pinn_dyn.app.prepared import PreparedTraining
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
+from pinn_dyn.data import LightningData
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
 from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
@@ -276,7 +277,7 @@ def train_network(
         clipping=clipping,
     )
     trainer.callbacks.insert(0, Recorder(training))  # type: ignore[attr-defined]
-    data: L.LightningDataModule = windows
+    data = LightningData(windows)
     if isinstance(model, Ensemble):
         data = EnsembleData(windows, model.size)
     try:

@@ -4,46 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import lightning as L
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import Sampler
 
-from pinn_dyn.data import DataSource, DynamicsData
-from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.data import DynamicsData, LightningData
+from pinn_dyn.data.windows import BatchSampler
 
 
-class EnsembleData(L.LightningDataModule):
+class EnsembleData(LightningData):
     """Data module in which member k has the training windows in the order of ``data.seed + k``."""
 
     def __init__(self, data: DynamicsData, members: int):
-        super().__init__()
-        self.data, self.members = data, members
+        super().__init__(data)
+        self.members = members
 
-    @property
-    def source(self) -> DataSource:
-        """Source of the trajectories."""
-        return self.data.source
-
-    @property
-    def windows(self) -> Windows:
-        """Training windows, the same for all members."""
-        return self.data.windows
-
-    def prepare_data(self) -> None:
-        """Simulate or convert the data once, before other processes read them."""
-        self.data.prepare_data()
-
-    def train_dataloader(self) -> WindowLoader:
-        """Return batches ``(E, B, ...)``."""
-        self.data.trainer = self.trainer  # for the device and the processes
-        seeds = range(self.data.seed, self.data.seed + self.members)
-        return self.data.loader(MemberSampler([self.data.sampler(seed) for seed in seeds]))
-
-    def val_dataloader(self) -> DataLoader[Trajectory]:
-        """Return a single batch of all validation trajectories."""
-        return self.data.val_dataloader()
+    def sampler(self, seed: int) -> MemberSampler:
+        """Return the positions in batches ``(E, B)``."""
+        seeds = range(seed, seed + self.members)
+        return MemberSampler([super(EnsembleData, self).sampler(seed) for seed in seeds])
 
 
 class MemberSampler(Sampler[Tensor]):

@@ -31,7 +31,7 @@ class RolloutFigures(L.Callback):
         datamodule = trainer.datamodule  # type: ignore[attr-defined]
         (truth,) = list(datamodule.val_dataloader())
         validator: Any = pl_module.validator
-        figures = validator.figures(pl_module.model, datamodule.source, truth)
+        figures = validator.figures(pl_module.model, datamodule.data.source, truth)
         # The step at which Lightning logs the errors of the same validation.
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):

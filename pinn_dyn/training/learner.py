@@ -234,7 +234,7 @@ class DynamicsLearner(L.LightningModule):
         weights = checkpoint["state_dict"]  # possibly averaged by a callback
         model = copy.deepcopy(self.model)
         model.load_state_dict({name.removeprefix("model."): x for name, x in weights.items()})
-        q = self.trainer.datamodule.windows.q  # type: ignore[attr-defined]
+        q = self.trainer.datamodule.data.windows.q  # type: ignore[attr-defined]
         limits = self.output_limits(model, q.to(next(model.parameters())))
         weights.update({f"model.{name}": limit for name, limit in limits.items()})
 
