@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pinn_dyn.lazy import LazyNames, lazy_attributes
 
 if TYPE_CHECKING:
-    from pinn_dyn.app.build import dataset as dataset
+    from pinn_dyn.app.dataset import dataset as dataset
     from pinn_dyn.app.evaluation import evaluate as evaluate
     from pinn_dyn.app.fit import fit as fit
     from pinn_dyn.app.run import Run as Run

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
 
-from pinn_dyn.app.config import ConfigError, build_part, composed
+from pinn_dyn.app.validation import ConfigError, check_value
 from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource
 from pinn_dyn.ensembles import Ensemble
@@ -27,15 +29,6 @@ def build_source(config: dict[str, Any]) -> DataSource:
     if "cache" in inspect.signature(pkgutil.resolve_name(part["_target_"])).parameters:
         part = {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn"), **part}
     return build_part("dataset", part)
-
-
-def dataset(name: str, **settings: Any) -> DataSource:
-    """Build a data set of ``conf/dataset``, such as ``dataset("soft_arm_1", duration=4.0)``.
-
-    ``settings`` replace arguments of the file ``<name>.yaml``.
-    """
-    overrides = [f"dataset={name}", *(f"dataset.{key}={x}" for key, x in settings.items())]
-    return build_source(composed("train", overrides))
 
 
 def model_builder(config: dict[str, Any]) -> ModelBuilder:
@@ -79,3 +72,47 @@ def build_law(
     if part.get("observer") is None:
         return law
     return build_part(f"controllers.{name}.observer", part["observer"], law)
+
+
+@contextlib.contextmanager
+def naming(part: str) -> Iterator[None]:
+    """Name the part of the configuration that an error is about."""
+    try:
+        yield
+    except Exception as error:
+        # The class of Lightning is compared by name, since the import takes seconds.
+        of_lightning = type(error).__name__ == "MisconfigurationException"
+        if isinstance(error, ConfigError) or not (
+            of_lightning or isinstance(error, TypeError | ValueError)
+        ):
+            raise
+        raise ConfigError(f"{part}: {error}") from error
+
+
+def build_part(
+    name: str, config: dict[str, Any], /, *arguments: Any, partial_: bool = False, **extra: Any
+) -> Any:
+    """Build the object that a part of the configuration describes; ``name`` is its path.
+
+    The program adds ``arguments`` and ``extra``, or takes a factory with ``partial_``. A
+    ConfigError names the argument that does not fit, or has the message of the constructor.
+    """
+    check_value(name, config)
+    try:
+        maker = _built({**config, "_partial_": True})
+        return maker if partial_ else maker(*arguments, **extra)
+    except Exception as error:  # constructors may raise anything
+        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{name}: {reason}") from error
+
+
+def _built(part: Any) -> Any:
+    if isinstance(part, list):
+        return [_built(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    values = {k: _built(x) for k, x in part.items() if k not in ("_target_", "_partial_")}
+    if "_target_" not in part:
+        return values
+    maker = partial(pkgutil.resolve_name(part["_target_"]), **values)
+    return maker if part.get("_partial_") else maker()

@@ -12,14 +12,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pinn_dyn.app.build import build_law, build_reference
-from pinn_dyn.app.config import ConfigError, build_part, checked, write_config
+from pinn_dyn.app.build import build_law, build_part, build_reference
+from pinn_dyn.app.config import checked
 from pinn_dyn.app.control_results import write_results
 from pinn_dyn.app.export import ranges_of
 from pinn_dyn.app.provenance import write_provenance
 from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import load_run
+from pinn_dyn.app.run_folder import load_run, write_config
 from pinn_dyn.app.trust import packages
+from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.control import (
     Controller,
     DataRegion,

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 from torch.nn.utils import vector_to_parameters
 
-from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import flattened, require_same_data
+from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import DataSource, LogSource, data_changes, data_identity
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models

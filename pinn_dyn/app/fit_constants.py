@@ -15,10 +15,11 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from pinn_dyn import evaluation
-from pinn_dyn.app.config import ConfigError, naming
+from pinn_dyn.app.build import naming
 from pinn_dyn.app.prepared import PreparedTraining
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD
+from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.whole import save_whole, write_whole
 from pinn_dyn.evaluation.identification import (

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from pinn_dyn.app.build import ModelBuilder
-from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.evaluation.structure_check import compare_structure
 from pinn_dyn.mechanics import Predictor, double_copy

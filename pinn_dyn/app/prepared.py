@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 
-from pinn_dyn.app.build import ModelBuilder, build_predictor
-from pinn_dyn.app.config import ConfigError, naming
+from pinn_dyn.app.build import ModelBuilder, build_predictor, naming
 from pinn_dyn.app.known_data import check_known, warn_of_structure
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run import TRAJECTORIES, Run
@@ -26,6 +25,7 @@ from pinn_dyn.app.run_folder import (
     in_one_line,
     require_same_data,
 )
+from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole

@@ -15,8 +15,8 @@ import torch
 import yaml
 
 from pinn_dyn import __version__
+from pinn_dyn.app.program import command_line
 from pinn_dyn.app.run import Run
-from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data import DataSource, data_identity
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.whole import write_whole

@@ -19,9 +19,10 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from pinn_dyn.app.config import ConfigError, naming
+from pinn_dyn.app.build import naming
 from pinn_dyn.app.prepared import PreparedTraining
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
+from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import LightningData
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner

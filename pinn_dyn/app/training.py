@@ -18,11 +18,11 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.app.build import ModelBuilder
-from pinn_dyn.app.command import hush
 from pinn_dyn.app.described import described
 from pinn_dyn.app.fit_constants import fit_constants
 from pinn_dyn.app.known_data import match_model
 from pinn_dyn.app.prepared import prepare, same_data
+from pinn_dyn.app.program import hush
 from pinn_dyn.app.run import TRAJECTORIES, Run
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,

@@ -3,7 +3,8 @@
 import pytest
 
 from pinn_dyn.app import trainer
-from pinn_dyn.app.config import ConfigError, build_part
+from pinn_dyn.app.build import build_part
+from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 
 
