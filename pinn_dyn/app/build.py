@@ -8,16 +8,18 @@ import os
 import pkgutil
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from pinn_dyn.app.validation import ConfigError, check_value
-from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.models import Statistics
+
+if TYPE_CHECKING:
+    from pinn_dyn.control import Controller, Reference
 
 ModelBuilder = Callable[..., Predictor]
 """Builder of a model, called with ``statistics=``."""

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
 from pinn_dyn import evaluation
 from pinn_dyn.app.build import naming
@@ -30,8 +29,8 @@ from pinn_dyn.evaluation.identification import (
     undetermined,
 )
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
-from pinn_dyn.evaluation.plots import units
 from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
+from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
@@ -180,6 +179,8 @@ def _write_log(
     loggers: Sequence[Any] | None,
 ) -> None:
     """Log metrics, and to TensorBoard settings and the figures of rollouts."""
+    from torch.utils.tensorboard import SummaryWriter  # takes half a second
+
     # Without callbacks, the module of the figures and Lightning are not imported.
     others = [x for x in callbacks or () if not isinstance(x, evaluation.RolloutFigures)]
     if others:

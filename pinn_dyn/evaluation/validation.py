@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
-from matplotlib.figure import Figure
 from pydantic import PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation.baselines import HoldPosition
-from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import compare_with_source
 from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, samples_of_window
 from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _HORIZON = 2.0  # s, of long trajectories
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
@@ -110,6 +112,9 @@ class RolloutValidator:
 
     def figures(self, model: Predictor, source: DataSource, truth: Trajectory) -> dict[str, Figure]:
         """Draw the rollout of the first trajectory, the errors and the learned terms."""
+        # Imports matplotlib.
+        from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
+
         predictions = {type(model).__name__: self.predict(model, truth)}
         figures = {
             "rollout/trajectory": trajectory_figure(
