@@ -8,8 +8,8 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import islice, repeat
 from typing import Any
 
+import scipy
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.utils.data import Sampler
 
@@ -194,7 +194,7 @@ def draw_windows(
         q = torch.cat(parts)[flat]
         z = (q / q.std(0).clamp(min=1e-12)).numpy()
         # The nearest neighbor is the row itself.
-        distance = torch.from_numpy(cKDTree(z).query(z, k=min(11, len(z)))[0][:, -1])
+        distance = torch.from_numpy(scipy.spatial.cKDTree(z).query(z, k=min(11, len(z)))[0][:, -1])
         # Rows with the largest log(uniform)/weight: Efraimidis and Spirakis (2006).
         uniform = torch.rand(len(z), generator=generator, dtype=torch.float64)
         weight = distance.clamp(min=1e-12) ** (coverage * q.shape[-1])

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy
 import torch
-from scipy.linalg import qr
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
@@ -178,7 +178,7 @@ def named_directions(space: np.ndarray, names: Sequence[str]) -> list[Direction]
     """
     if not len(space):
         return []
-    _, _, order = qr(space, mode="economic", pivoting=True)
+    _, _, order = scipy.linalg.qr(space, mode="economic", pivoting=True)
     pivots = np.sort(order[: len(space)])
     directions = []
     for k, row in zip(pivots, np.linalg.solve(space[:, pivots], space), strict=True):
