@@ -127,9 +127,8 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     actuators, equalities = (ET.SubElement(root, tag) for tag in ("actuator", "equality"))
     poses, bodies = tree.placements.numpy(), central_parameters(constants.inertia)
     for k, (pose, body) in enumerate(zip(poses, tree.bodies, strict=True)):
-        w, x, y, z = scipy.spatial.transform.Rotation.from_matrix(pose[:3, :3]).as_quat()[
-            [3, 0, 1, 2]
-        ]
+        rotation = scipy.spatial.transform.Rotation.from_matrix(pose[:3, :3])
+        w, x, y, z = rotation.as_quat()[[3, 0, 1, 2]]
         frame = {"pos": exact_text(pose[:3, 3]), "quat": exact_text([w, x, y, z])}
         element = ET.SubElement(elements[tree.parents[k] + 1], "body", frame, name=body)
         elements.append(element)
