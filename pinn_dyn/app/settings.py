@@ -166,7 +166,7 @@ class ControlSettings(_RunSettings):
 
 
 @dataclass(kw_only=True)
-class Kinematics:
+class KnownStructure:
     """Known structure of the robot, before a model is chosen."""
 
     structure: Structure | None = None
@@ -177,7 +177,7 @@ class CheckSettings:
     """Keys of check.py."""
 
     dataset: DataSource
-    model: Kinematics | Mapping[str, Any]
+    model: KnownStructure | Mapping[str, Any]
     longest_delay: PositiveFloat
 
 
