@@ -7,12 +7,12 @@ from typing import Any
 
 import lightning as L
 
-from pinn_dyn.app import prepared, trainer
-from pinn_dyn.app.build import build_part, build_predictor, build_source, model_builder
 from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
+from pinn_dyn.run import prepared, trainer
+from pinn_dyn.run.build import build_part, build_predictor, build_source, model_builder
 from pinn_dyn.training import DynamicsLearner
 
 

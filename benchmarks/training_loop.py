@@ -40,13 +40,13 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from pinn_dyn.app import build, trainer
 from pinn_dyn.app.config import composed
-from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data import DataSource, LightningData, Splits
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.run import build, trainer
+from pinn_dyn.run.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results"
 STEP = 2e-3

@@ -20,9 +20,9 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.config import completed, composed, config_folder, explained
-from pinn_dyn.app.program import hush
 from pinn_dyn.app.sweep import write_error
-from pinn_dyn.app.validation import ConfigError
+from pinn_dyn.run.program import hush
+from pinn_dyn.run.validation import ConfigError
 
 
 def main(command: str) -> None:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.settings import SETTINGS
-from pinn_dyn.app.validation import ConfigError, check_arguments, check_keys, check_value
+from pinn_dyn.run.validation import ConfigError, check_arguments, check_keys, check_value
 from pinn_dyn.spelling import did_you_mean
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.

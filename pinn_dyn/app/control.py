@@ -12,15 +12,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pinn_dyn.app.build import build_law, build_part, build_reference
 from pinn_dyn.app.config import checked
 from pinn_dyn.app.control_results import write_results
-from pinn_dyn.app.export import ranges_of
-from pinn_dyn.app.provenance import write_provenance
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import load_run, write_config
-from pinn_dyn.app.trust import packages
-from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.control import (
     Controller,
     DataRegion,
@@ -34,6 +27,13 @@ from pinn_dyn.data import DataSource, SimulationError
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
+from pinn_dyn.run.build import build_law, build_part, build_reference
+from pinn_dyn.run.export import ranges_of
+from pinn_dyn.run.provenance import write_provenance
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.run_folder import load_run, write_config
+from pinn_dyn.run.trust import packages
+from pinn_dyn.run.validation import ConfigError
 
 log = logging.getLogger(__name__)
 

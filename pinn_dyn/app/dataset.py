@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import composed
 from pinn_dyn.data import DataSource
+from pinn_dyn.run.build import build_source
 
 
 def dataset(name: str, **settings: Any) -> DataSource:

@@ -7,11 +7,11 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from pinn_dyn.app.build import build_part
 from pinn_dyn.app.config import checked
-from pinn_dyn.app.run_folder import write_config
-from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.evaluation.excitation_design import design_excitation
+from pinn_dyn.run.build import build_part
+from pinn_dyn.run.run_folder import write_config
+from pinn_dyn.run.validation import ConfigError
 
 
 def excite(cfg: DictConfig) -> None:

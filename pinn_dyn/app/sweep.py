@@ -19,7 +19,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pinn_dyn.app.program import program
+from pinn_dyn.run.program import program
 from pinn_dyn.workers import end_with_parent
 
 log = logging.getLogger(__name__)

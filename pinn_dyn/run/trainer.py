@@ -19,10 +19,6 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from pinn_dyn.app.build import naming
-from pinn_dyn.app.prepared import PreparedTraining
-from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
-from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import LightningData
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
@@ -32,6 +28,10 @@ from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
 from pinn_dyn.progress import Progress
+from pinn_dyn.run.build import naming
+from pinn_dyn.run.prepared import PreparedTraining
+from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
+from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.training import DynamicsLearner, WholeCheckpoints, WindowLoss
 
 LONGEST_EPOCH = 1000

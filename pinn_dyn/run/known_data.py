@@ -10,12 +10,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from pinn_dyn.app.build import ModelBuilder
-from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.evaluation.structure_check import compare_structure
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
+from pinn_dyn.run.build import ModelBuilder
+from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.systems import RigidChain
 
 log = logging.getLogger(__name__)

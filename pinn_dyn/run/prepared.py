@@ -12,20 +12,6 @@ from typing import Any
 
 import torch
 
-from pinn_dyn.app.build import ModelBuilder, build_predictor, naming
-from pinn_dyn.app.known_data import check_known, warn_of_structure
-from pinn_dyn.app.provenance import provenance
-from pinn_dyn.app.run import TRAJECTORIES, Run
-from pinn_dyn.app.run_folder import (
-    DATA,
-    RECORD,
-    REPLACE,
-    finish,
-    flattened,
-    in_one_line,
-    require_same_data,
-)
-from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
@@ -34,6 +20,20 @@ from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
+from pinn_dyn.run.build import ModelBuilder, build_predictor, naming
+from pinn_dyn.run.known_data import check_known, warn_of_structure
+from pinn_dyn.run.provenance import provenance
+from pinn_dyn.run.run import TRAJECTORIES, Run
+from pinn_dyn.run.run_folder import (
+    DATA,
+    RECORD,
+    REPLACE,
+    finish,
+    flattened,
+    in_one_line,
+    require_same_data,
+)
+from pinn_dyn.run.validation import ConfigError
 
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pinn_dyn.app.validation import ConfigError, check_value
 from pinn_dyn.data import DataSource
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.models import Statistics
+from pinn_dyn.run.validation import ConfigError, check_value
 
 if TYPE_CHECKING:
     from pinn_dyn.control import Controller, Reference

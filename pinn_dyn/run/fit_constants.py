@@ -14,11 +14,6 @@ import torch
 from torch import Tensor
 
 from pinn_dyn import evaluation
-from pinn_dyn.app.build import naming
-from pinn_dyn.app.prepared import PreparedTraining
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD
-from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.whole import save_whole, write_whole
 from pinn_dyn.evaluation.identification import (
@@ -33,6 +28,11 @@ from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
+from pinn_dyn.run.build import naming
+from pinn_dyn.run.prepared import PreparedTraining
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
+from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
 
 log = logging.getLogger(__name__)

@@ -15,11 +15,11 @@ import torch
 import yaml
 
 from pinn_dyn import __version__
-from pinn_dyn.app.program import command_line
-from pinn_dyn.app.run import Run
 from pinn_dyn.data import DataSource, data_identity
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.run.program import command_line
+from pinn_dyn.run.run import Run
 
 if TYPE_CHECKING:
     from pinn_dyn.evaluation.report.page import Origin

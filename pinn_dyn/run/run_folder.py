@@ -17,16 +17,16 @@ import yaml
 from filelock import FileLock, Timeout
 
 from pinn_dyn import __version__
-from pinn_dyn.app.build import ModelBuilder, build_predictor, model_builder
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.trust import is_trusted, packages, require_trusted
-from pinn_dyn.app.validation import ConfigError
 from pinn_dyn.data import data_changes
 from pinn_dyn.data.whole import save_whole, write_whole
 from pinn_dyn.evaluation.tables import short
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import set_output_limits
+from pinn_dyn.run.build import ModelBuilder, build_predictor, model_builder
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.trust import is_trusted, packages, require_trusted
+from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
 from pinn_dyn.training import COVARIANCE, FIT

@@ -17,21 +17,6 @@ from pydantic import PositiveInt
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from pinn_dyn.app.build import ModelBuilder
-from pinn_dyn.app.described import described
-from pinn_dyn.app.fit_constants import fit_constants
-from pinn_dyn.app.known_data import match_model
-from pinn_dyn.app.prepared import prepare, same_data
-from pinn_dyn.app.program import hush
-from pinn_dyn.app.run import TRAJECTORIES, Run
-from pinn_dyn.app.run_folder import (
-    CHECKPOINTS,
-    FINISHED,
-    claimed,
-    load_run,
-    merged,
-    with_structures,
-)
 from pinn_dyn.data import DataSource, DynamicsData, LogSource
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.evaluation import RolloutValidator
@@ -43,6 +28,21 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     NextStateMLP,
     SubspaceEncoder,
+)
+from pinn_dyn.run.build import ModelBuilder
+from pinn_dyn.run.described import described
+from pinn_dyn.run.fit_constants import fit_constants
+from pinn_dyn.run.known_data import match_model
+from pinn_dyn.run.prepared import prepare, same_data
+from pinn_dyn.run.program import hush
+from pinn_dyn.run.run import TRAJECTORIES, Run
+from pinn_dyn.run.run_folder import (
+    CHECKPOINTS,
+    FINISHED,
+    claimed,
+    load_run,
+    merged,
+    with_structures,
 )
 from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.training import IncrementLoss, LeastSquares, MidpointLoss, WindowLoss, one_cycle
@@ -201,7 +201,7 @@ def train(
             elif isinstance(optimizer, LeastSquares):
                 fit_constants(prepare_now, optimizer, saved, start_from, **reports)
             else:
-                from pinn_dyn.app.trainer import train_network  # imports Lightning
+                from pinn_dyn.run.trainer import train_network  # imports Lightning
 
                 train_network(
                     prepare_now,
