@@ -42,7 +42,7 @@ from torch import Tensor
 
 from pinn_dyn.app.config import composed
 from pinn_dyn.data import DataSource, LightningData, Splits
-from pinn_dyn.ensembles import Ensemble, EnsembleData
+from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.run import build, trainer
@@ -247,7 +247,7 @@ def rival(loops: Any, config: dict[str, Any], data: Any, clock: int) -> tuple[st
 
 def batches(data: Any, members: int) -> Iterator[Tensor]:
     """Positions of an epoch's batches, ``(B,)``, or of each member's, ``(E, B)``."""
-    samplers = [data.sampler(seed) for seed in range(members)]
+    samplers = [LightningData(data).sampler(seed) for seed in range(members)]
     if members == 1:
         return iter(samplers[0])
     return map(torch.stack, zip(*samplers, strict=True))
@@ -260,7 +260,7 @@ def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Call
         lightning = configured.build_trainer(config, place)
         lightning.callbacks = [*callbacks, *lightning.callbacks]  # type: ignore[attr-defined]
         members = config["ensemble"]
-        lightning.fit(learner, EnsembleData(data, members) if members > 1 else LightningData(data))
+        lightning.fit(learner, LightningData(data, members if members > 1 else None))
 
 
 def schedule(config: dict[str, Any], learner: Any) -> list[float]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pinn_dyn.lazy import LazyNames, lazy_attributes
 
 if TYPE_CHECKING:
-    from pinn_dyn.app.dataset import dataset as dataset
+    from pinn_dyn.app.config import dataset as dataset
     from pinn_dyn.data import DataSource as DataSource
     from pinn_dyn.data import LogSource as LogSource
     from pinn_dyn.data import Splits as Splits

@@ -14,11 +14,10 @@ from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation.log_check import LogCheck
 from pinn_dyn.evaluation.log_check import check as check_log
 from pinn_dyn.evaluation.structure_check import SCALE
-from pinn_dyn.run.build import build_part, build_source, naming
+from pinn_dyn.run.build import ConfigError, build_part, build_source, naming
 from pinn_dyn.run.known_data import match_structure
 from pinn_dyn.run.program import command_line
 from pinn_dyn.run.run_folder import write_config
-from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.systems import RigidChain
 
 

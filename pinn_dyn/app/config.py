@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -18,6 +18,9 @@ from omegaconf.errors import OmegaConfBaseException
 from pinn_dyn.app.settings import SETTINGS
 from pinn_dyn.run.validation import ConfigError, check_arguments, check_keys, check_value
 from pinn_dyn.spelling import did_you_mean
+
+if TYPE_CHECKING:
+    from pinn_dyn.data import DataSource
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
@@ -135,3 +138,14 @@ def explained(error: HydraException | OmegaConfBaseException) -> str:
         hint = did_you_mean(option, error.options)
         return f"'{group}/{option}' does not exist{hint or '.'} Options of {group}: {options}"
     return " ".join(str(error).partition("Config search path")[0].split())
+
+
+def dataset(name: str, **settings: Any) -> DataSource:
+    """Build a data set of ``conf/dataset``, such as ``dataset("soft_arm_1", duration=4.0)``.
+
+    ``settings`` replace arguments of the file ``<name>.yaml``.
+    """
+    from pinn_dyn.run.build import build_source  # imports PyTorch, which --help does not need
+
+    overrides = [f"dataset={name}", *(f"dataset.{key}={x}" for key, x in settings.items())]
+    return build_source(composed("train", overrides))

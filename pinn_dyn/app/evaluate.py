@@ -10,12 +10,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
-from pinn_dyn.run.build import build_source
+from pinn_dyn.run.build import ConfigError, build_source
 from pinn_dyn.run.evaluation import evaluate
 from pinn_dyn.run.provenance import write_provenance
 from pinn_dyn.run.run_folder import CONFIG, load_run
 from pinn_dyn.run.trust import packages
-from pinn_dyn.run.validation import ConfigError
 
 
 def main(cfg: DictConfig) -> float:

@@ -9,9 +9,8 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
 from pinn_dyn.evaluation.excitation_design import design_excitation
-from pinn_dyn.run.build import build_part
+from pinn_dyn.run.build import ConfigError, build_part
 from pinn_dyn.run.run_folder import write_config
-from pinn_dyn.run.validation import ConfigError
 
 
 def excite(cfg: DictConfig) -> None:

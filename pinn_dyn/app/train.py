@@ -17,7 +17,7 @@ from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.run import training
-from pinn_dyn.run.build import build_part, build_source, model_builder
+from pinn_dyn.run.build import ConfigError, build_part, build_source, model_builder
 from pinn_dyn.run.run_folder import (
     CHECKPOINTS,
     load_run,
@@ -27,7 +27,6 @@ from pinn_dyn.run.run_folder import (
 )
 from pinn_dyn.run.trainer import tensorboard
 from pinn_dyn.run.trust import check_name, packages, require_trusted
-from pinn_dyn.run.validation import ConfigError
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from pinn_dyn.data.lengths import seconds_of
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.data.windows import BatchSampler, Windows, draw_windows
+from pinn_dyn.data.windows import Windows, draw_windows
 from pinn_dyn.mechanics import samples_of
 from pinn_dyn.models.statistics import Statistics
 
@@ -99,14 +99,3 @@ class DynamicsData:
     def statistics(self) -> Statistics:
         """Scales of the training windows."""
         return self.windows.statistics()
-
-    def sampler(self, seed: int, rank: int = 0, processes: int = 1) -> BatchSampler:
-        """Return the order of the windows by a seed, for one of several processes."""
-        return BatchSampler(
-            len(self.windows),
-            batch_size=self.batch_size,
-            batches=self.batches_per_epoch,
-            seed=seed,
-            rank=rank,
-            processes=processes,
-        )

@@ -8,18 +8,15 @@ import os
 import pkgutil
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from pinn_dyn.data import DataSource
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.mechanics import MechanicalSystem, Predictor
+from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.run.validation import ConfigError, check_value
-
-if TYPE_CHECKING:
-    from pinn_dyn.control import Controller, Reference
 
 ModelBuilder = Callable[..., Predictor]
 """Builder of a model, called with ``statistics=``."""
@@ -53,27 +50,6 @@ def build_predictor(
         torch.manual_seed(seed + k)
         members.append(model(statistics=statistics))
     return Ensemble(members)
-
-
-def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:
-    """Build ``config["reference"]``; one that needs the robot's kinematics gets the robot."""
-    part = config["reference"]
-    return build_part("reference", part, *([robot] if part.get("_partial_") else []))
-
-
-def build_law(
-    config: dict[str, Any], name: str, learned: Predictor, truth: MechanicalSystem
-) -> Controller:
-    """Build one of ``config["controllers"]`` on the terms that it names, with its observer."""
-    part = config["controllers"][name]
-    model = learned if part["terms"] == "learned" else truth
-    accepted = inspect.signature(pkgutil.resolve_name(part["law"]["_target_"])).parameters
-    gains = {f"{key}_gain": value for key, value in config["gains"].items()}
-    gains = {key: value for key, value in gains.items() if key in accepted}
-    law = build_part(f"controllers.{name}.law", {**gains, **part["law"]}, model)
-    if part.get("observer") is None:
-        return law
-    return build_part(f"controllers.{name}.observer", part["observer"], law)
 
 
 @contextlib.contextmanager

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from pinn_dyn import evaluation
 from pinn_dyn.data import DataSource
@@ -28,11 +29,10 @@ from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
-from pinn_dyn.run.build import naming
+from pinn_dyn.run.build import ConfigError, naming
 from pinn_dyn.run.prepared import PreparedTraining
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
-from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
 
 log = logging.getLogger(__name__)
@@ -128,13 +128,8 @@ def _fitted(
     covariance = None if start_from is None else start_from.covariance
     if start_from is not None and covariance is None:
         raise ConfigError("start_from: the run has no covariance of its constants")
-
-    def part_errors(model: LearnedConstants) -> Tensor:
-        with torch.no_grad():
-            return training.validator.part_errors(model, truth)
-
-    runs = data.splits.train
-    return solver.fit(model, runs, data.windows, covariance, result, part_errors, keep)
+    errors = torch.no_grad()(partial(training.validator.part_errors, truth=truth))
+    return solver.fit(model, data.splits.train, data.windows, covariance, result, errors, keep)
 
 
 @contextlib.contextmanager
@@ -143,15 +138,11 @@ def _sigterm_exits() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # which alone receives signals
         yield
         return
-    before = signal.signal(signal.SIGTERM, _exit)
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _exit(number: int, frame: object) -> None:
-    raise SystemExit(128 + number)
 
 
 def _save(name: str, training: PreparedTraining, result: Fit, record: dict[str, Any]) -> None:
@@ -182,11 +173,9 @@ def _write_log(
     from torch.utils.tensorboard import SummaryWriter  # takes half a second
 
     # Without callbacks, the module of the figures and Lightning are not imported.
-    others = [x for x in callbacks or () if not isinstance(x, evaluation.RolloutFigures)]
-    if others:
-        log.warning("least squares uses no callbacks but RolloutFigures")
+    draws = [isinstance(x, evaluation.RolloutFigures) for x in callbacks or ()]
     figures = {}
-    if callbacks is None or len(others) < len(callbacks):
+    if callbacks is None or any(draws):
         figures = training.validator.figures(training.model, training.windows.source, truth)
     for logger in loggers or ():
         logger.log_metrics(metrics, 0)

@@ -20,7 +20,7 @@ from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
-from pinn_dyn.run.build import ModelBuilder, build_predictor, naming
+from pinn_dyn.run.build import ConfigError, ModelBuilder, build_predictor, naming
 from pinn_dyn.run.known_data import check_known, warn_of_structure
 from pinn_dyn.run.provenance import provenance
 from pinn_dyn.run.run import TRAJECTORIES, Run
@@ -33,7 +33,6 @@ from pinn_dyn.run.run_folder import (
     in_one_line,
     require_same_data,
 )
-from pinn_dyn.run.validation import ConfigError
 
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""
@@ -141,8 +140,10 @@ def prepare(
     with naming("model"):
         predictor = build_predictor(model, statistics, config["seed"], config["ensemble"])
         _check_windows(predictor, windows)
-    check_known(predictor, source)
-    warn_of_structure(predictor, source)
+    known = predictor.known if isinstance(predictor, KnownAndNetwork) else predictor
+    if isinstance(known, KnownMechanics):
+        check_known(known, source)
+        warn_of_structure(known, source)
     if start_from is not None and not saved:
         _take_weights(predictor, start_from)
     facts = {"name": config["name"], "seed": config["seed"], "pairs": len(windows.windows)}

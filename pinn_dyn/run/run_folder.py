@@ -23,10 +23,9 @@ from pinn_dyn.evaluation.tables import short
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import set_output_limits
-from pinn_dyn.run.build import ModelBuilder, build_predictor, model_builder
+from pinn_dyn.run.build import ConfigError, ModelBuilder, build_predictor, model_builder
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.trust import is_trusted, packages, require_trusted
-from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
 from pinn_dyn.training import COVARIANCE, FIT

@@ -21,17 +21,16 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.data import LightningData
 from pinn_dyn.data.simulation import has_cpp_compiler
-from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
+from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
 from pinn_dyn.evaluation.metrics import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
 from pinn_dyn.progress import Progress
-from pinn_dyn.run.build import naming
+from pinn_dyn.run.build import ConfigError, naming
 from pinn_dyn.run.prepared import PreparedTraining
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
-from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.training import DynamicsLearner, WholeCheckpoints, WindowLoss
 
 LONGEST_EPOCH = 1000
@@ -58,13 +57,19 @@ def build_learner(
     with naming("loss"):
         single = model.member(0) if isinstance(model, Ensemble) else model
         window_loss = loss(statistics=statistics, model=single)
-    common: dict[str, Any] = dict(
-        loss=window_loss, validator=validator, config=config, statistics=statistics
-    )
+    learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
     with naming("optimizer"):
-        learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
-        common |= dict(optimizer=optimizer, scheduler=scheduler, compile=compile)
-        return learner(model, **common, **clipping)
+        return learner(
+            model,
+            loss=window_loss,
+            optimizer=optimizer,
+            scheduler=scheduler,
+            validator=validator,
+            config=config,
+            statistics=statistics,
+            compile=compile,
+            **clipping,
+        )
 
 
 def epochs(steps: int, validations: int) -> tuple[int, int, int]:
@@ -278,9 +283,7 @@ def train_network(
         clipping=clipping,
     )
     trainer.callbacks.insert(0, Recorder(training))  # type: ignore[attr-defined]
-    data = LightningData(windows)
-    if isinstance(model, Ensemble):
-        data = EnsembleData(windows, model.size)
+    data = LightningData(windows, model.size if isinstance(model, Ensemble) else None)
     try:
         # The optimizer of an ensemble is built inside of fit.
         with naming("optimizer") if isinstance(model, Ensemble) else contextlib.nullcontext():

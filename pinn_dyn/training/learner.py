@@ -140,7 +140,11 @@ class DynamicsLearner(L.LightningModule):
             for logger in trainer.loggers:
                 logger.log_metrics(figures, self.global_step - 1)
         if before + done >= trainer.num_training_batches:
-            self.log_losses(torch.stack(self._losses).mean(0))
+            # The mean of the epoch, over the processes that share a batch.
+            means: Any = self.loss_figures(torch.stack(self._losses).mean(0))
+            self.log_dict(
+                means, logger=False, on_step=False, on_epoch=True, sync_dist=True, batch_size=1
+            )
 
     def _count_steps(self, done: int) -> None:
         """Count steps in the loop of Lightning, which has no public way to count several."""
@@ -204,11 +208,6 @@ class DynamicsLearner(L.LightningModule):
                     f"the training loss became {loss} at step {step} (epoch {self.current_epoch}): "
                     "reduce optimizer.lr, or use shorter windows (data.steps, data.stride)"
                 )
-
-    def log_losses(self, losses: Tensor) -> None:
-        """Record the mean loss of an epoch, over the processes that share a batch."""
-        options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
-        self.log_dict(self.loss_figures(losses), logger=False, batch_size=1, **options)
 
     def loss_figures(self, losses: Tensor) -> dict[str, Tensor]:
         """Return named figures of losses, ``()`` or one for each member of an ensemble."""

@@ -6,7 +6,7 @@ import pytest
 from hydra._internal.config_repository import ConfigRepository as Hydra
 
 from pinn_dyn.app.config import CONF, composed
-from pinn_dyn.run.build import build_reference
+from pinn_dyn.app.control import build_reference
 from pinn_dyn.systems import TendonArm
 from tests.app.entry import (
     NO_FIGURES,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pinn_dyn.data import LightningData
-from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
+from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.ensembles.gradients import CompiledMembers
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.mechanics import Signal, double_copy
@@ -97,7 +97,7 @@ def test_members_end_with_the_weights_that_they_have_on_a_cpu(tmp_path):
         ensemble = Ensemble(models)
         compiled = accelerator == "gpu"
         learner = learn(EnsembleLearner, ensemble, models[0], data, compile=compiled)
-        train(tmp_path, learner, EnsembleData(data, 2), accelerator=accelerator)
+        train(tmp_path, learner, LightningData(data, 2), accelerator=accelerator)
         ends.append([p.detach().cpu() for p in ensemble.parameters()])
     for found, expected in zip(*ends, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=2e-4)
