@@ -181,25 +181,25 @@ def train(
         config = _description(source, model, model_name, parts | {"validator": validator})
         config |= {**settings, **start, "trainer": {**length, **trainer}}
     config = merged(with_structures(config), {"model": changes} if changes else {})
-    arguments: dict[str, Any] = dict(
-        source=source,
-        model=model,
-        data=data,
-        validator=validator,
-        config=config,
-        folder=run_folder,
-        stores=made_in_python and temporary is None,
-        start_from=start_from,
-    )
-    reports: dict[str, Any] = dict(callbacks=callbacks, loggers=loggers)
     try:
         with _isolated(threads), claimed(run_folder, config, overwrite) as (checkpoint, saved):
-            prepare_now = partial(prepare, saved=saved, **arguments)
+            prepare_now = partial(
+                prepare,
+                source=source,
+                model=model,
+                data=data,
+                validator=validator,
+                config=config,
+                folder=run_folder,
+                stores=made_in_python and temporary is None,
+                saved=saved,
+                start_from=start_from,
+            )
             if saved.get(FINISHED):
                 same_data(source, run_folder, saved)
                 log.info("already trained: %s is loaded; overwrite=True trains again", run_folder)
             elif isinstance(optimizer, LeastSquares):
-                fit_constants(prepare_now, optimizer, saved, start_from, **reports)
+                fit_constants(prepare_now, optimizer, saved, start_from, callbacks, loggers)
             else:
                 from pinn_dyn.run.trainer import train_network  # imports Lightning
 
@@ -212,7 +212,8 @@ def train(
                     compile=compile,
                     settings=trainer,
                     parts=dict(loss=loss, optimizer=optimizer, scheduler=scheduler),
-                    **reports,
+                    callbacks=callbacks,
+                    loggers=loggers,
                 )
     except KeyboardInterrupt:
         way = _way_on(run_folder, temporary is not None, overwrite)
