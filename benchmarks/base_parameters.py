@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from scipy.linalg import qr
 
-from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.models import KnownMechanics
+from pinn_dyn.run.run_folder import load_run
 from pinn_dyn.systems import RigidChain
 
 STATES = 3000

@@ -12,7 +12,6 @@ import sys
 
 import pandas as pd
 
-from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import composed
 from pinn_dyn.evaluation import (
     build_baselines,
@@ -20,6 +19,7 @@ from pinn_dyn.evaluation import (
     rollout_metrics,
 )
 from pinn_dyn.mechanics import Predictor, stack_until
+from pinn_dyn.run.build import build_source
 
 LINEAR_STEP = 0.01  # smallest step of the linear baselines, s; smaller steps give larger errors
 # Horizon, step of the rollouts and windows of each data set, s.

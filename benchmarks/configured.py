@@ -7,13 +7,12 @@ from typing import Any
 
 import lightning as L
 
-from pinn_dyn.app import trainer, training
-from pinn_dyn.app.build import build_source, model_builder
-from pinn_dyn.app.config import build_part
 from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
+from pinn_dyn.run import prepared, trainer
+from pinn_dyn.run.build import build_part, build_predictor, build_source, model_builder
 from pinn_dyn.training import DynamicsLearner
 
 
@@ -21,12 +20,12 @@ def build_data(config: dict[str, Any], source: DataSource | None = None) -> Dyna
     """Build the windows of a configuration, on a source or else that of the configuration."""
     batches = trainer.epochs(config["trainer"]["steps"], config["trainer"]["validations"])[1]
     builder = build_part("data", config["data"], partial_=True)
-    return training.build_data(builder, source or build_source(config), config["seed"], batches)
+    return prepared.build_data(builder, source or build_source(config), config["seed"], batches)
 
 
 def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
     """Build the model of a configuration, scaled to the data."""
-    return training.build_predictor(model_builder(config), statistics, config["seed"])
+    return build_predictor(model_builder(config), statistics, config["seed"])
 
 
 def build_validator(config: dict[str, Any], step: float) -> RolloutValidator:

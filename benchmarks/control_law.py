@@ -29,13 +29,13 @@ from configured import build_model
 from hydra import compose, initialize_config_dir
 
 from pinn_dyn.app.config import CONF, plain
-from pinn_dyn.app.provenance import provenance
-from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.control import Tracking, export_law
 from pinn_dyn.control.export import INPUTS
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.predictor import double_copy
 from pinn_dyn.models import Statistics
+from pinn_dyn.run.provenance import provenance
+from pinn_dyn.run.run_folder import load_run
 from pinn_dyn.systems.urdf import read_urdf
 
 RESULTS = Path(__file__).parent / "results"

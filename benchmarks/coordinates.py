@@ -22,9 +22,9 @@ import torch
 from training_loop import RESULTS, append, rows_of
 from training_step import make_model, make_windows
 
-from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data.simulation import simulate
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.run.provenance import provenance
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.training import MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager

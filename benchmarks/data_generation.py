@@ -22,12 +22,12 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import CONF, plain
-from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data import SimulatedSource
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.run.build import build_source
+from pinn_dyn.run.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results"
 ROLLOUT_STEP = 0.002  # s

@@ -28,14 +28,13 @@ from torch import Tensor
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
-from pinn_dyn.app.provenance import provenance
-from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows
+from pinn_dyn.data.windows import BatchSampler, MemberSampler, WindowLoader, Windows
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.ensembles.data import MemberSampler
 from pinn_dyn.ensembles.gradients import CompiledMembers
 from pinn_dyn.ensembles.learner import MemberSOAP
 from pinn_dyn.mechanics import Predictor, Signal
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.run.provenance import provenance
 from pinn_dyn.training import SOAP, IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.adamw import clipped
 from pinn_dyn.training.gradients import Compiled, Eager, Engine

@@ -31,7 +31,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from pinn_dyn.app.provenance import provenance
+from pinn_dyn.run.provenance import provenance
 from tests.support.processes import alive
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -24,9 +24,9 @@ from configured import build_model
 from training_step import STEP, make_windows
 
 from pinn_dyn.app.config import composed
-from pinn_dyn.app.provenance import provenance
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.models import Statistics
+from pinn_dyn.run.provenance import provenance
 from pinn_dyn.training import IncrementLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager
 

@@ -25,7 +25,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pinn_dyn.app.provenance import provenance
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports import c_loop
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, double_copy
@@ -39,6 +38,7 @@ from pinn_dyn.models import (
     Positive,
     Statistics,
 )
+from pinn_dyn.run.provenance import provenance
 from pinn_dyn.systems import MujocoArm, RigidChain
 
 HERE = Path(__file__).parent

@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from pinn_dyn.app.provenance import provenance
+from pinn_dyn.run.provenance import provenance
 
 HERE = Path(__file__).parent
 TRAIN = HERE.parent / "train.py"

@@ -31,11 +31,11 @@ from configured import build_data, build_learner, build_model, build_validator
 from hydra import compose, initialize_config_dir
 
 from pinn_dyn.app.config import CONF, plain
-from pinn_dyn.app.provenance import provenance
-from pinn_dyn.app.trainer import epochs
-from pinn_dyn.data import DynamicsData
+from pinn_dyn.data import DynamicsData, LightningData
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Predictor, Trajectory, stack
+from pinn_dyn.run.provenance import provenance
+from pinn_dyn.run.trainer import epochs
 
 PAPER_ERROR = {"hnn": 0.022, "lnn": 0.171}
 HORIZON = 5.0  # s
@@ -102,7 +102,7 @@ def ours(config: dict[str, Any], data: DynamicsData, goal: float, clock: Clock) 
         enable_model_summary=False,
         callbacks=[StopAtGoal(clock, goal, truth, validator.step)],
     )
-    trainer.fit(learner, data)
+    trainer.fit(learner, LightningData(data))
 
 
 def paper(data: DynamicsData, goal: float, clock: Clock, kind: str, options: Any) -> None:

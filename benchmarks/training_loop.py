@@ -40,13 +40,13 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from pinn_dyn.app import build, trainer, training
 from pinn_dyn.app.config import composed
-from pinn_dyn.app.provenance import provenance
-from pinn_dyn.data import DataSource, Splits
-from pinn_dyn.ensembles import Ensemble, EnsembleData
+from pinn_dyn.data import DataSource, LightningData, Splits
+from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.run import build, trainer
+from pinn_dyn.run.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results"
 STEP = 2e-3
@@ -177,7 +177,7 @@ def run_cell(
     config = configuration(size, batch, loss, optimizer, members, device, compiled)
     L.seed_everything(0, verbose=False)
     data = configured.build_data(config, Sines(size))
-    model = training.build_predictor(
+    model = build.build_predictor(
         build.model_builder(config), data.statistics, 0, config["ensemble"]
     )
     validator = configured.build_validator(config, data.statistics.step)
@@ -247,7 +247,7 @@ def rival(loops: Any, config: dict[str, Any], data: Any, clock: int) -> tuple[st
 
 def batches(data: Any, members: int) -> Iterator[Tensor]:
     """Positions of an epoch's batches, ``(B,)``, or of each member's, ``(E, B)``."""
-    samplers = [data.sampler(seed) for seed in range(members)]
+    samplers = [LightningData(data).sampler(seed) for seed in range(members)]
     if members == 1:
         return iter(samplers[0])
     return map(torch.stack, zip(*samplers, strict=True))
@@ -260,7 +260,7 @@ def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Call
         lightning = configured.build_trainer(config, place)
         lightning.callbacks = [*callbacks, *lightning.callbacks]  # type: ignore[attr-defined]
         members = config["ensemble"]
-        lightning.fit(learner, EnsembleData(data, members) if members > 1 else data)
+        lightning.fit(learner, LightningData(data, members if members > 1 else None))
 
 
 def schedule(config: dict[str, Any], learner: Any) -> list[float]:
@@ -289,7 +289,7 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
     trainer.LONGEST_EPOCH, steps = CHECKED, trainer.LONGEST_EPOCH
     data = configured.build_data(config, data.source)
     L.seed_everything(0, verbose=False)
-    model = training.build_predictor(
+    model = build.build_predictor(
         build.model_builder(config), data.statistics, 0, config["ensemble"]
     )
     start = {name: p.detach().clone() for name, p in model.named_parameters()}

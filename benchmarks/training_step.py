@@ -39,7 +39,6 @@ import torch
 from hessian_baseline import HessianBaseline
 from torch import Tensor
 
-from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Signal
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
@@ -51,6 +50,7 @@ from pinn_dyn.models import (
     Positive,
     Statistics,
 )
+from pinn_dyn.run.provenance import provenance
 from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Engine
 

@@ -19,7 +19,7 @@ import griffe
 import yaml
 
 from pinn_dyn.app.settings import SETTINGS
-from pinn_dyn.app.validation import arguments_model
+from pinn_dyn.run.validation import arguments_model
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"

@@ -11,12 +11,7 @@ from typing import TYPE_CHECKING
 from pinn_dyn.lazy import LazyNames, lazy_attributes
 
 if TYPE_CHECKING:
-    from pinn_dyn.app.build import dataset as dataset
-    from pinn_dyn.app.evaluation import evaluate as evaluate
-    from pinn_dyn.app.fit import fit as fit
-    from pinn_dyn.app.run import Run as Run
-    from pinn_dyn.app.run_folder import load as load
-    from pinn_dyn.app.training import train as train
+    from pinn_dyn.app.config import dataset as dataset
     from pinn_dyn.data import DataSource as DataSource
     from pinn_dyn.data import LogSource as LogSource
     from pinn_dyn.data import Splits as Splits
@@ -27,6 +22,11 @@ if TYPE_CHECKING:
     from pinn_dyn.mechanics import Signal as Signal
     from pinn_dyn.mechanics import Terms as Terms
     from pinn_dyn.mechanics import Trajectory as Trajectory
+    from pinn_dyn.run.evaluation import evaluate as evaluate
+    from pinn_dyn.run.fit import fit as fit
+    from pinn_dyn.run.run import Run as Run
+    from pinn_dyn.run.run_folder import load as load
+    from pinn_dyn.run.training import train as train
     from pinn_dyn.systems import SoftArm as SoftArm
 
 __version__ = "0.4.0"

@@ -13,8 +13,6 @@ import torch
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import load
 from pinn_dyn.control import DataRegion, Plant, SystemPlant
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation.prediction import model_for_rollouts
@@ -22,6 +20,8 @@ from pinn_dyn.exports.c_draws import LoopOfDraws
 from pinn_dyn.exports.c_loop import CLoop, Loop
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.rollout import path_between
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.run_folder import load
 
 try:
     import gymnasium

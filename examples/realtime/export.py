@@ -7,9 +7,9 @@ import argparse
 from pathlib import Path
 
 import pinn_dyn
-from pinn_dyn.app.export import export
 from pinn_dyn.control import Actuator, DisturbanceObserver, Tracking, export_law
 from pinn_dyn.mechanics import double_copy
+from pinn_dyn.run.export import export
 from pinn_dyn.systems import RigidChain
 
 here = Path(__file__).parent

@@ -1,1 +1,1 @@
-"""The only room that knows Hydra: builds objects from configurations and runs the entry points."""
+"""The only room that knows Hydra: composes configurations and runs the entry points."""

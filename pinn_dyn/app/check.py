@@ -9,14 +9,15 @@ import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from pinn_dyn.app.build import build_source
-from pinn_dyn.app.config import ConfigError, build_part, checked, naming, write_config
-from pinn_dyn.app.known_data import match_structure
-from pinn_dyn.app.sweep import command_line
+from pinn_dyn.app.config import checked
 from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation.log_check import LogCheck
 from pinn_dyn.evaluation.log_check import check as check_log
 from pinn_dyn.evaluation.structure_check import SCALE
+from pinn_dyn.run.build import ConfigError, build_part, build_source, naming
+from pinn_dyn.run.known_data import match_structure
+from pinn_dyn.run.program import command_line
+from pinn_dyn.run.run_folder import write_config
 from pinn_dyn.systems import RigidChain
 
 

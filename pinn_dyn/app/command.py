@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import importlib
 import io
-import logging
 import os
 import re
 import sys
-import warnings
 from contextlib import nullcontext, redirect_stdout
 from functools import partial
 from pathlib import Path
@@ -21,8 +19,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.config import ConfigError, completed, composed, config_folder, explained
+from pinn_dyn.app.config import completed, composed, config_folder, explained
 from pinn_dyn.app.sweep import write_error
+from pinn_dyn.run.program import hush
+from pinn_dyn.run.validation import ConfigError
 
 
 def main(command: str) -> None:
@@ -73,14 +73,6 @@ def _run(command: str, cfg: DictConfig) -> object:
             raise  # SweepCallback goes on with the other jobs
         write_error(Path(HydraConfig.get().runtime.output_dir), error)
         raise SystemExit(f"Error: {error}") from error
-
-
-def hush() -> None:
-    """Suppress messages that users cannot act on: about hardware, and between our libraries."""
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
-    warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
-    warnings.filterwarnings("ignore", r"The `srun` command is available")
 
 
 COMMANDS = ("train", "evaluate", "control", "gather", "check", "excite")

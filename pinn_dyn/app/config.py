@@ -1,17 +1,13 @@
-"""Configurations: composed by Hydra, checked before anything runs, and built part by part."""
+"""Configurations: composed by Hydra, and checked before anything runs."""
 
 from __future__ import annotations
 
-import contextlib
-import pkgutil
 import re
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
@@ -20,13 +16,15 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.settings import SETTINGS
-from pinn_dyn.app.validation import ConfigError, check_arguments, check_keys, check_value
+from pinn_dyn.run.validation import ConfigError, check_arguments, check_keys, check_value
 from pinn_dyn.spelling import did_you_mean
+
+if TYPE_CHECKING:
+    from pinn_dyn.data import DataSource
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 _RUNS = {"evaluate": "runs=[{}]", "gather": "runs=[{}]", "control": "run={}"}
-CONFIG = "config.yaml"  # in the folder of a run
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
@@ -142,53 +140,12 @@ def explained(error: HydraException | OmegaConfBaseException) -> str:
     return " ".join(str(error).partition("Config search path")[0].split())
 
 
-@contextlib.contextmanager
-def naming(part: str) -> Iterator[None]:
-    """Name the part of the configuration that an error is about."""
-    try:
-        yield
-    except Exception as error:
-        # The class of Lightning is compared by name, since the import takes seconds.
-        of_lightning = type(error).__name__ == "MisconfigurationException"
-        if isinstance(error, ConfigError) or not (
-            of_lightning or isinstance(error, TypeError | ValueError)
-        ):
-            raise
-        raise ConfigError(f"{part}: {error}") from error
+def dataset(name: str, **settings: Any) -> DataSource:
+    """Build a data set of ``conf/dataset``, such as ``dataset("soft_arm_1", duration=4.0)``.
 
-
-def write_config(folder: Path, config: dict[str, Any]) -> None:
-    """Write the resolved configuration of a run."""
-    from pinn_dyn.data.whole import write_whole  # imports PyTorch, which --help does not need
-
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
-
-
-def build_part(
-    name: str, config: dict[str, Any], /, *arguments: Any, partial_: bool = False, **extra: Any
-) -> Any:
-    """Build the object that a part of the configuration describes; ``name`` is its path.
-
-    The program adds ``arguments`` and ``extra``, or takes a factory with ``partial_``. A
-    ConfigError names the argument that does not fit, or has the message of the constructor.
+    ``settings`` replace arguments of the file ``<name>.yaml``.
     """
-    check_value(name, config)
-    try:
-        maker = _built({**config, "_partial_": True})
-        return maker if partial_ else maker(*arguments, **extra)
-    except Exception as error:  # constructors may raise anything
-        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{name}: {reason}") from error
+    from pinn_dyn.run.build import build_source  # imports PyTorch, which --help does not need
 
-
-def _built(part: Any) -> Any:
-    if isinstance(part, list):
-        return [_built(item) for item in part]
-    if not isinstance(part, dict):
-        return part
-    values = {k: _built(x) for k, x in part.items() if k not in ("_target_", "_partial_")}
-    if "_target_" not in part:
-        return values
-    maker = partial(pkgutil.resolve_name(part["_target_"]), **values)
-    return maker if part.get("_partial_") else maker()
+    overrides = [f"dataset={name}", *(f"dataset.{key}={x}" for key, x in settings.items())]
+    return build_source(composed("train", overrides))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
+import pkgutil
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +14,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pinn_dyn.app.build import build_law, build_reference
-from pinn_dyn.app.config import ConfigError, build_part, checked, write_config
+from pinn_dyn.app.config import checked
 from pinn_dyn.app.control_results import write_results
-from pinn_dyn.app.export import ranges_of
-from pinn_dyn.app.provenance import write_provenance
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import load_run
-from pinn_dyn.app.trust import packages
 from pinn_dyn.control import (
     Controller,
     DataRegion,
     DisturbanceObserver,
     Guarded,
+    Reference,
     export_law,
     term_conditions,
 )
@@ -32,7 +29,13 @@ from pinn_dyn.control.dead_time import compensated
 from pinn_dyn.data import DataSource, SimulationError
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
-from pinn_dyn.mechanics import MechanicalSystem, double_copy
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
+from pinn_dyn.run.build import ConfigError, build_part
+from pinn_dyn.run.export import ranges_of
+from pinn_dyn.run.provenance import write_provenance
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.run_folder import load_run, write_config
+from pinn_dyn.run.trust import packages
 
 log = logging.getLogger(__name__)
 
@@ -212,3 +215,24 @@ def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Con
     model = (law.law if isinstance(law, DisturbanceObserver) else law).model  # type: ignore[attr-defined]
     region = DataRegion(q, v, angles=getattr(model, "angles", source.angles))
     return Guarded(law, region, **config["guard"])
+
+
+def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:
+    """Build ``config["reference"]``; one that needs the robot's kinematics gets the robot."""
+    part = config["reference"]
+    return build_part("reference", part, *([robot] if part.get("_partial_") else []))
+
+
+def build_law(
+    config: dict[str, Any], name: str, learned: Predictor, truth: MechanicalSystem
+) -> Controller:
+    """Build one of ``config["controllers"]`` on the terms that it names, with its observer."""
+    part = config["controllers"][name]
+    model = learned if part["terms"] == "learned" else truth
+    accepted = inspect.signature(pkgutil.resolve_name(part["law"]["_target_"])).parameters
+    gains = {f"{key}_gain": value for key, value in config["gains"].items()}
+    gains = {key: value for key, value in gains.items() if key in accepted}
+    law = build_part(f"controllers.{name}.law", {**gains, **part["law"]}, model)
+    if part.get("observer") is None:
+        return law
+    return build_part(f"controllers.{name}.observer", part["observer"], law)

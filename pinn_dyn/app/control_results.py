@@ -30,10 +30,9 @@ from pinn_dyn.evaluation import (
     tip_path_figure,
 )
 from pinn_dyn.evaluation.control_figures import ERROR, control_errors
-from pinn_dyn.evaluation.plots import with_unit
 from pinn_dyn.evaluation.report.control_page import control_report, shown_columns
 from pinn_dyn.evaluation.report.page import Origin
-from pinn_dyn.evaluation.tables import to_text, write_table
+from pinn_dyn.evaluation.tables import to_text, with_unit, write_table
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Drawable, HasTip
 

@@ -9,12 +9,12 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from pinn_dyn.app.build import build_source
-from pinn_dyn.app.config import CONFIG, ConfigError, checked
-from pinn_dyn.app.evaluation import evaluate
-from pinn_dyn.app.provenance import write_provenance
-from pinn_dyn.app.run_folder import load_run
-from pinn_dyn.app.trust import packages
+from pinn_dyn.app.config import checked
+from pinn_dyn.run.build import ConfigError, build_source
+from pinn_dyn.run.evaluation import evaluate
+from pinn_dyn.run.provenance import write_provenance
+from pinn_dyn.run.run_folder import CONFIG, load_run
+from pinn_dyn.run.trust import packages
 
 
 def main(cfg: DictConfig) -> float:

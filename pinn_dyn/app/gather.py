@@ -14,12 +14,13 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from pandas.api.types import is_numeric_dtype
 
-from pinn_dyn.app.config import CONFIG, ConfigError, checked
-from pinn_dyn.app.run_folder import METRICS
+from pinn_dyn.app.config import checked
 from pinn_dyn.app.sweep import ERROR, first_line
 from pinn_dyn.data.whole import read_regular
 from pinn_dyn.evaluation import save, sweep_figure
 from pinn_dyn.evaluation.tables import competing, over_seeds, to_text, varied_settings, write_table
+from pinn_dyn.run.run_folder import CONFIG, METRICS
+from pinn_dyn.run.validation import ConfigError
 
 _RECORDED = ("training_seconds", "steps", "pairs", "parameters")
 _SHOWN = ("val/error_mean", "val/diverged", "test/error_mean", "test/diverged", "training_seconds")

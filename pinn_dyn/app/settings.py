@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pinn_dyn.app.signatures import STAND_INS
-from pinn_dyn.app.validation import Seed
+from pinn_dyn.run.signatures import STAND_INS
+from pinn_dyn.run.validation import Seed
 
 if TYPE_CHECKING:
     from lightning import Callback, Trainer
@@ -166,7 +166,7 @@ class ControlSettings(_RunSettings):
 
 
 @dataclass(kw_only=True)
-class Kinematics:
+class KnownStructure:
     """Known structure of the robot, before a model is chosen."""
 
     structure: Structure | None = None
@@ -177,7 +177,7 @@ class CheckSettings:
     """Keys of check.py."""
 
     dataset: DataSource
-    model: Kinematics | Mapping[str, Any]
+    model: KnownStructure | Mapping[str, Any]
     longest_delay: PositiveFloat
 
 

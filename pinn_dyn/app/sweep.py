@@ -6,7 +6,6 @@ import logging
 import math
 import re
 import shlex
-import shutil
 import sys
 import traceback
 from functools import partial
@@ -20,6 +19,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from pinn_dyn.run.program import program
 from pinn_dyn.workers import end_with_parent
 
 log = logging.getLogger(__name__)
@@ -93,22 +93,10 @@ def first_line(path: Path) -> str:
         return file.readline(10_000).rstrip("\n")
 
 
-def command_line() -> str:
-    """Return the command of this process, for a shell."""
-    return shlex.join([*_program(), *(word.removeprefix("++") for word in sys.argv[1:])])
-
-
 def resume_command(folder: Path) -> str:
     """Return the command that resumes a training of this process, for a shell."""
     config_dir = get_args_parser().parse_intermixed_args(sys.argv[1:]).config_dir
     options = [f"--config-dir={config_dir}"] if config_dir else []
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     value = folder if re.fullmatch(r"[\w./-]+", str(folder)) else f"'{quoted}'"  # for Hydra
-    return shlex.join([*_program(), *options, f"resume={value}"])
-
-
-def _program() -> list[str]:
-    path = Path(sys.argv[0])
-    if path.suffix == ".py":
-        return ["python", str(path)]
-    return [path.name if shutil.which(path.name) else str(path)]
+    return shlex.join([*program(), *options, f"resume={value}"])

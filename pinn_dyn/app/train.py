@@ -12,21 +12,21 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pinn_dyn.app import training
-from pinn_dyn.app.build import build_source, model_builder
-from pinn_dyn.app.config import ConfigError, build_part, checked
-from pinn_dyn.app.run_folder import (
+from pinn_dyn.app.config import checked
+from pinn_dyn.app.sweep import resume_command
+from pinn_dyn.data.whole import write_whole
+from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.run import training
+from pinn_dyn.run.build import ConfigError, build_part, build_source, model_builder
+from pinn_dyn.run.run_folder import (
     CHECKPOINTS,
     load_run,
     newest_checkpoint,
     read_checkpoint,
     require_no_links_out,
 )
-from pinn_dyn.app.sweep import resume_command
-from pinn_dyn.app.trainer import tensorboard
-from pinn_dyn.app.trust import check_name, packages, require_trusted
-from pinn_dyn.data.whole import write_whole
-from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.run.trainer import tensorboard
+from pinn_dyn.run.trust import check_name, packages, require_trusted
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import scipy
 import torch
-from scipy.sparse import block_diag
 from torch import Tensor
 
 from pinn_dyn.control.closed_loop import LoopRun, finite_rows, motion_of_copies
@@ -79,7 +78,7 @@ def close_loop_continuous(
             float(run.t[-1]),
             rtol=share * _RTOL,
             atol=share * _ATOL,
-            jac_sparsity=block_diag([np.ones((size, size))] * count),
+            jac_sparsity=scipy.sparse.block_diag([np.ones((size, size))] * count),
             vectorized=True,
         )
         with Progress(progress, duration, "s") as lines:

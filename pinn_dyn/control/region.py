@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+import scipy
 import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion, Reference
@@ -69,9 +69,9 @@ class DataRegion:
         count = min(samples, len(states))
         drawn = np.random.default_rng(0).choice(len(states), count, replace=False)
         states, trajectory = states[drawn] / self._scale, trajectory[drawn]
-        self._tree = cKDTree(states)
+        self._tree = scipy.spatial.cKDTree(states)
         distances = [
-            cKDTree(states[trajectory != k]).query(states[trajectory == k])[0]
+            scipy.spatial.cKDTree(states[trajectory != k]).query(states[trajectory == k])[0]
             for k in np.unique(trajectory)
         ]
         self.radius = float(np.percentile(np.concatenate(distances), 99))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 import torch
-from scipy.linalg import solve_discrete_are
 from torch import Tensor
 
 from pinn_dyn.exports.c_library import compiled_rows
@@ -161,7 +161,7 @@ class ShootingProblem:
         A, B = np.linalg.solve(left, np.eye(2 * n) + h / 2 * A), np.linalg.solve(left, h * B)
         try:
             Q, R = h * np.diag(self.weights.state), h * np.diag(self.weights.input)
-            return solve_discrete_are(A, B, Q, R)
+            return scipy.linalg.solve_discrete_are(A, B, Q, R)
         except np.linalg.LinAlgError as error:
             raise ValueError(
                 f"no linear law holds the model at q = {x[:n].round(4).tolist()} ({error}): set "

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.data.excitation import Chirp, Excitation, Mixture, MultiSine, Steps
 from pinn_dyn.data.identity import data_changes, data_identity
 from pinn_dyn.data.logs import Cleaned, LogError, LogSource
@@ -19,7 +20,7 @@ from pinn_dyn.data.windows import Windows, draw_windows
 from pinn_dyn.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from pinn_dyn.data.datamodule import DynamicsData
+    from pinn_dyn.data.lightning_data import LightningData
 
 __all__ = [
     "Chirp",
@@ -28,6 +29,7 @@ __all__ = [
     "DynamicsData",
     "Excitation",
     "InitialStates",
+    "LightningData",
     "LogError",
     "LogSource",
     "Mixture",

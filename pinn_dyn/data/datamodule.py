@@ -1,4 +1,4 @@
-"""The LightningDataModule: windows for training, whole trajectories for validation and test."""
+"""Training windows of a data source, and whole trajectories for validation and test."""
 
 from __future__ import annotations
 
@@ -6,22 +6,18 @@ import functools
 import logging
 from typing import Annotated, Literal
 
-import lightning as L
-import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
-from torch import Tensor
-from torch.utils.data import DataLoader, Sampler
 
 from pinn_dyn.data.lengths import seconds_of
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows, draw_windows
-from pinn_dyn.mechanics import Trajectory, samples_of, stack_until
+from pinn_dyn.data.windows import Windows, draw_windows
+from pinn_dyn.mechanics import samples_of
 from pinn_dyn.models.statistics import Statistics
 
 log = logging.getLogger(__name__)
 
 
-class DynamicsData(L.LightningDataModule):
+class DynamicsData:
     """Training pairs from a data source, drawn from its training trajectories alone.
 
     Args:
@@ -51,14 +47,9 @@ class DynamicsData(L.LightningDataModule):
         coverage: Annotated[float, Field(ge=0, le=1)] = 0.0,
         history: NonNegativeFloat = 0.0,
     ):
-        super().__init__()
         self.source, self.pairs, self.steps, self.stride = source, pairs, steps, stride
         self.batch_size, self.batches_per_epoch, self.seed = batch_size, batches_per_epoch, seed
         self.coverage, self.history = coverage, history
-
-    def prepare_data(self) -> None:
-        """Simulate or convert the data once, before other processes read them."""
-        self.splits  # noqa: B018
 
     @functools.cached_property
     def splits(self) -> Splits:
@@ -108,28 +99,3 @@ class DynamicsData(L.LightningDataModule):
     def statistics(self) -> Statistics:
         """Scales of the training windows."""
         return self.windows.statistics()
-
-    def train_dataloader(self) -> WindowLoader:
-        """Return batches of windows in single precision, a share for each of several processes."""
-        return self.loader(self.sampler(self.seed))
-
-    def sampler(self, seed: int) -> BatchSampler:
-        """Return the order of the windows by a seed."""
-        trainer = self.trainer
-        return BatchSampler(
-            len(self.windows),
-            batch_size=self.batch_size,
-            batches=self.batches_per_epoch,
-            seed=seed,
-            rank=0 if trainer is None else trainer.global_rank,
-            processes=1 if trainer is None else trainer.world_size,
-        )
-
-    def loader(self, sampler: Sampler[Tensor]) -> WindowLoader:
-        """Move the windows to the device that trains, where batches are picked."""
-        device = torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
-        return WindowLoader(self.windows.to(device, torch.float32), sampler)
-
-    def val_dataloader(self) -> DataLoader[Trajectory]:
-        """Return one batch: all validation trajectories, up to the end of the shortest."""
-        return DataLoader([stack_until(self.splits.validation)], batch_size=None)  # type: ignore[arg-type]

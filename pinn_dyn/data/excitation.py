@@ -26,7 +26,9 @@ InputSignal = Callable[[np.ndarray], np.ndarray]
 """Maps times ``(T,)`` in s to inputs ``(count, T, M)``: ``count`` signals drawn together."""
 
 
-def joined(signals: Sequence[InputSignal], which: np.ndarray, row: np.ndarray) -> InputSignal:
+def picked_signals(
+    signals: Sequence[InputSignal], which: np.ndarray, row: np.ndarray
+) -> InputSignal:
     """Join signals of several draws: signal k is number ``row[k]`` of ``signals[which[k]]``."""
 
     def signal(t: np.ndarray) -> np.ndarray:
@@ -170,4 +172,4 @@ class Mixture(Excitation):
         signals = [
             part.draw(len(index[k::kinds]), duration, rng) for k, part in enumerate(self.parts)
         ]
-        return joined(signals, index % kinds, index // kinds)
+        return picked_signals(signals, index % kinds, index // kinds)

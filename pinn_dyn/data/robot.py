@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays
 from pinn_dyn.data.fingerprint import describe
-from pinn_dyn.data.robot_excitation import Plan, RobotExcitation
+from pinn_dyn.data.robot_excitation import DrawnMotion, RobotExcitation
 from pinn_dyn.data.simulated import RecordedSource, split_recordings
 from pinn_dyn.data.source import SPLITS
 from pinn_dyn.progress import Progress
@@ -126,7 +126,7 @@ class RobotSource(RecordedSource):
             )
         return split_recordings(t, motions, self.counts)
 
-    def _record(self, plan: Plan, t: np.ndarray) -> np.ndarray:
+    def _record(self, plan: DrawnMotion, t: np.ndarray) -> np.ndarray:
         """Record q, v and u of K motions that advance step by step together, ``(3, K, T, N)``."""
         arm = self.system
         q, v, u = motions = np.empty((3, len(plan.q0), len(t), arm.num_coordinates))

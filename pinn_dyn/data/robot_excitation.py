@@ -20,7 +20,7 @@ Fraction = Annotated[float, Field(gt=0, le=1)]
 Generators = Sequence[np.random.Generator]
 
 
-class Plan(NamedTuple):
+class DrawnMotion(NamedTuple):
     """K motions to record: initial states ``(K, N)`` and laws u_k = torque(k, q_k, v_k)."""
 
     q0: np.ndarray
@@ -33,7 +33,7 @@ class RobotExcitation(abc.ABC):
     """A family of random motions of a robot; a dataclass, as its fields are part of a cache key."""
 
     @abc.abstractmethod
-    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
+    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> DrawnMotion:
         """Draw a motion from each generator for the sample times ``t`` ``(T,)``, s."""
 
 
@@ -71,7 +71,7 @@ class TrackedMultiSine(RobotExcitation):
     harmonics: PositiveInt = 4
     bandwidth: PositiveFloat = 10.0
 
-    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
+    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> DrawnMotion:
         """Draw references and their tracking law."""
         draws = [self._draw_sines(robot, float(t[-1]), rng) for rng in rngs]
         centre, *sines = (np.stack(values) for values in zip(*draws, strict=True))
@@ -82,7 +82,7 @@ class TrackedMultiSine(RobotExcitation):
             return robot.motor_torque(q, v, a_ref + 2 * w * (v_ref - v) + w**2 * (q_ref - q))
 
         q0, v0, _ = _reference(t[0], centre, *sines)
-        return Plan(q0, v0, law)
+        return DrawnMotion(q0, v0, law)
 
     def _draw_sines(
         self, robot: SimulatedArm, duration: float, rng: np.random.Generator
@@ -149,7 +149,7 @@ class TorqueMultiSine(RobotExcitation):
     reach: Fraction
     harmonics: PositiveInt = 4
 
-    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
+    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> DrawnMotion:
         """Draw torque signals and centres."""
         half = (robot.q_high - robot.q_low) / 2
         peak = self.amplitude * robot.u_max
@@ -169,4 +169,4 @@ class TorqueMultiSine(RobotExcitation):
             gravity = robot.motor_torque(q, zero, zero)
             return gravity + stiffness * (centre - q) - friction * v + signal[:, k]
 
-        return Plan(centre + signal[:, 0] / stiffness, zero, law)
+        return DrawnMotion(centre + signal[:, 0] / stiffness, zero, law)

@@ -15,7 +15,7 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveIn
 from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays, load_or_make
-from pinn_dyn.data.excitation import Excitation, InputSignal, joined
+from pinn_dyn.data.excitation import Excitation, InputSignal, picked_signals
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.simulation import SimulationError, momentum, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
@@ -307,7 +307,7 @@ class SimulatedSource(RecordedSource):
             signals.append(self.excitation.draw(inputs, self.duration, rng))
             rows += [(index, number) for number in pairs[:, 1]]
         q0, v0 = np.concatenate(starts, axis=1)
-        return q0, v0, joined(signals, *np.array(rows).T)
+        return q0, v0, picked_signals(signals, *np.array(rows).T)
 
     def _record(
         self, rngs: Mapping[str, np.random.Generator], t: np.ndarray, rows: np.ndarray, draws: int
@@ -315,7 +315,7 @@ class SimulatedSource(RecordedSource):
         """Simulate some draws of the motions of given numbers, draw after draw."""
         q0, v0, signals = zip(*(self._draw(rngs) for _ in range(draws)), strict=True)
         draw, row = np.repeat(np.arange(draws), len(rows)), np.tile(rows, draws)
-        signal = joined(signals, draw, row)
+        signal = picked_signals(signals, draw, row)
         q, v = simulate(
             self.system,
             np.stack(q0)[draw, row],

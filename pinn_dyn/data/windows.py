@@ -8,8 +8,8 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import islice, repeat
 from typing import Any
 
+import scipy
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.utils.data import Sampler
 
@@ -194,7 +194,7 @@ def draw_windows(
         q = torch.cat(parts)[flat]
         z = (q / q.std(0).clamp(min=1e-12)).numpy()
         # The nearest neighbor is the row itself.
-        distance = torch.from_numpy(cKDTree(z).query(z, k=min(11, len(z)))[0][:, -1])
+        distance = torch.from_numpy(scipy.spatial.cKDTree(z).query(z, k=min(11, len(z)))[0][:, -1])
         # Rows with the largest log(uniform)/weight: Efraimidis and Spirakis (2006).
         uniform = torch.rand(len(z), generator=generator, dtype=torch.float64)
         weight = distance.clamp(min=1e-12) ** (coverage * q.shape[-1])
@@ -298,3 +298,21 @@ class BatchSampler(Sampler[Tensor]):
             order = torch.randperm(self.size, generator=generator)[: per_pass * self.batch_size]
             rows = order.view(per_pass, -1)[:, self.rank :: self.processes]
             yield from rows[: self.batches - first].unbind()
+
+
+class MemberSampler(Sampler[Tensor]):
+    """Sampler of batches ``(E, batch_size)`` from a sampler for each member."""
+
+    def __init__(self, samplers: list[BatchSampler]):
+        self.samplers = samplers
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch, as the trainer does at its start."""
+        for sampler in self.samplers:
+            sampler.set_epoch(epoch)
+
+    def __len__(self) -> int:
+        return len(self.samplers[0])
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return map(torch.stack, zip(*self.samplers, strict=True))

@@ -7,8 +7,7 @@ from pinn_dyn.ensembles.posterior import posterior_draws
 from pinn_dyn.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from pinn_dyn.ensembles.data import EnsembleData
     from pinn_dyn.ensembles.learner import EnsembleLearner
 
-__all__ = ["Ensemble", "EnsembleData", "EnsembleLearner", "posterior_draws"]
+__all__ = ["Ensemble", "EnsembleLearner", "posterior_draws"]
 __getattr__ = lazy_attributes(__name__)

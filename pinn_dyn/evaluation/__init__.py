@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     )
     from pinn_dyn.evaluation.log_figures import cleaning_figure
     from pinn_dyn.evaluation.plots import save
-    from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
+    from pinn_dyn.evaluation.rollout_figures import RolloutFigures
+    from pinn_dyn.evaluation.validation import RolloutValidator
 
 __all__ = [
     "Calibration",

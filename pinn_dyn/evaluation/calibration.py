@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from pinn_dyn.evaluation.metrics import diverged_trajectories
-from pinn_dyn.evaluation.plots import legend_below, model_style
 from pinn_dyn.evaluation.prediction import Prediction
 
 LEVEL = 0.95
@@ -97,26 +94,3 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
 def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
     finite = np.sort(errors[np.isfinite(errors)])
     return np.searchsorted(finite, width, side="right") / max(len(errors), 1)
-
-
-def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title: str) -> Figure:
-    """Draw the coverage of intervals over their nominal level, for the longest window of each run.
-
-    An interval on the diagonal has the nominal coverage; below the diagonal it is too narrow.
-    """
-    figure = Figure(figsize=(6.0, 4.4 + 0.25 * len(runs)), layout="constrained")
-    ax = figure.subplots()
-    ax.plot([0, 100], [0, 100], color="black", linewidth=0.8, label="nominal")
-    for index, (run, items) in enumerate(runs.items()):
-        window, color = max(items), model_style(index)["color"]
-        item, label = items[window], f"{run}, reset every {window:g} s"
-        ax.plot(100 * item.level, 100 * item.share, "o-", color=color, markersize=4, label=label)
-        if item.corrected is not None:
-            label = f"{run}, width from validation"
-            ax.plot(100 * item.level, 100 * item.corrected, "--", color=color, label=label)
-    ax.set(xlabel="nominal level [%]", xlim=(0, 100), ylim=(0, 101))
-    ax.set_ylabel("errors within the interval [%]")
-    ax.grid(True, alpha=0.3)
-    legend_below(figure, columns=1, fontsize="small")
-    figure.suptitle(title)
-    return figure

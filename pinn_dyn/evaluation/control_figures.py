@@ -21,8 +21,8 @@ from pinn_dyn.evaluation.plots import (
     model_style,
     panels,
     set_log_axis,
-    with_unit,
 )
+from pinn_dyn.evaluation.tables import with_unit
 
 ERROR = "‖q_ref − q‖₂"
 

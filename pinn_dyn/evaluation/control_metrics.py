@@ -90,7 +90,7 @@ def closed_loop_metrics(
         "rms_error": mean(square).sqrt(),
         "max_error": marked(error.abs().amax(dim=1)).amax(dim=0),
     }
-    step = _step(record)
+    step = _set_point_step(record)
     if step is None:
         summary["steady_state_error"] = mean(steady)
     else:
@@ -159,7 +159,7 @@ def samples_before_stop(record: ClosedLoopRecord, run: int) -> int:
     return int(torch.isfinite(record.q[run]).all(dim=-1).int().cumprod(0).sum())
 
 
-def _step(record: ClosedLoopRecord) -> Tensor | None:
+def _set_point_step(record: ClosedLoopRecord) -> Tensor | None:
     """Return q_ref - q(0), ``(K, N)``; None unless all references are set points off q(0)."""
     q_ref = record.reference.q.double()
     first = q_ref[:, :1]

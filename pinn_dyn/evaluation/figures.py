@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from pinn_dyn.evaluation.calibration import Calibration
 from pinn_dyn.evaluation.learned_terms import TermComparison
 from pinn_dyn.evaluation.metrics import diverged_trajectories
 from pinn_dyn.evaluation.plots import (
@@ -23,10 +24,9 @@ from pinn_dyn.evaluation.plots import (
     model_style,
     panels,
     set_log_axis,
-    with_unit,
 )
 from pinn_dyn.evaluation.prediction import Prediction
-from pinn_dyn.evaluation.tables import number
+from pinn_dyn.evaluation.tables import number, with_unit
 from pinn_dyn.mechanics import Trajectory
 
 ERROR = "‖q̂ − q‖₂"
@@ -174,4 +174,27 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: Sequence[str], y: str) ->
         ax.set_xscale("log")
     ax.grid(True, alpha=0.3)
     legend_below(figure, title=", ".join(lines) or None, fontsize="small")
+    return figure
+
+
+def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title: str) -> Figure:
+    """Draw the coverage of intervals over their nominal level, for the longest window of each run.
+
+    An interval on the diagonal has the nominal coverage; below the diagonal it is too narrow.
+    """
+    figure = Figure(figsize=(6.0, 4.4 + 0.25 * len(runs)), layout="constrained")
+    ax = figure.subplots()
+    ax.plot([0, 100], [0, 100], color="black", linewidth=0.8, label="nominal")
+    for index, (run, items) in enumerate(runs.items()):
+        window, color = max(items), model_style(index)["color"]
+        item, label = items[window], f"{run}, reset every {window:g} s"
+        ax.plot(100 * item.level, 100 * item.share, "o-", color=color, markersize=4, label=label)
+        if item.corrected is not None:
+            label = f"{run}, width from validation"
+            ax.plot(100 * item.level, 100 * item.corrected, "--", color=color, label=label)
+    ax.set(xlabel="nominal level [%]", xlim=(0, 100), ylim=(0, 101))
+    ax.set_ylabel("errors within the interval [%]")
+    ax.grid(True, alpha=0.3)
+    legend_below(figure, columns=1, fontsize="small")
+    figure.suptitle(title)
     return figure

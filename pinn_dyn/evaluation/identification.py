@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from io import StringIO
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy
 import torch
-from scipy.linalg import qr
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
+from pinn_dyn.data.whole import read_regular
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.known import KnownMechanics
 from pinn_dyn.models.known_constants import Named, PositiveConstants
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.training.constants_fit import Fit, posterior_covariance
 
+CONSTANTS = "constants.csv"
+"""File of the table of constants in a run folder."""
 COLUMNS = ["name", "value", "low", "high", "unit", "start", "known"]
 """Columns of the table of constants."""
 OPEN = 0.5
@@ -32,6 +37,15 @@ class Direction(NamedTuple):
     parameter: int
     direction: np.ndarray
     text: str
+
+
+def read_constants(folders: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
+    """Read the constants of runs by their names; earlier versions wrote fewer columns."""
+    return {
+        name: pd.read_csv(StringIO(read_regular(path))).reindex(columns=COLUMNS)
+        for name, folder in folders.items()
+        if (path := folder / CONSTANTS).is_file()
+    }
 
 
 def constants_table(
@@ -164,7 +178,7 @@ def named_directions(space: np.ndarray, names: Sequence[str]) -> list[Direction]
     """
     if not len(space):
         return []
-    _, _, order = qr(space, mode="economic", pivoting=True)
+    _, _, order = scipy.linalg.qr(space, mode="economic", pivoting=True)
     pivots = np.sort(order[: len(space)])
     directions = []
     for k, row in zip(pivots, np.linalg.solve(space[:, pivots], space), strict=True):

@@ -55,7 +55,7 @@ def identify_payload(
         ValueError: as :meth:`LeastSquares.fit <pinn_dyn.training.LeastSquares.fit>`, or if the tip
             is fixed to the base.
     """
-    joint = _Loaded(double_copy(model)).requires_grad_()
+    joint = _LoadedRobot(double_copy(model)).requires_grad_()
     runs = [_marked(run, 0.0) for run in without] + [_marked(run, 1.0) for run in loaded]
     solver = LeastSquares(cutoff=cutoff, rollouts=False, samples=samples)
     fit = solver.fit(cast(LearnedConstants, joint), runs)
@@ -78,7 +78,7 @@ def identify_payload(
     return table
 
 
-class _Loaded(nn.Module):
+class _LoadedRobot(nn.Module):
     """Known mechanics with a load where the last input is 1."""
 
     def __init__(self, mechanics: KnownMechanics):
@@ -113,7 +113,7 @@ class _Loaded(nn.Module):
     def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         return self.known.force_scale(q, v, a, u[:, :-1])
 
-    def slopes(self) -> _Loaded:
+    def slopes(self) -> _LoadedRobot:
         return self
 
     def gain(self) -> Tensor:
@@ -124,7 +124,7 @@ class _Loaded(nn.Module):
 
 
 class _Samples:
-    def __init__(self, model: _Loaded, q: Tensor, v: Tensor, a: Tensor, u: Tensor):
+    def __init__(self, model: _LoadedRobot, q: Tensor, v: Tensor, a: Tensor, u: Tensor):
         self.load, self.known = model.load, model.known.samples(q, v, a, u[:, :-1])
         rows = model.known.structure.regressor(q, v, a)[..., model.columns] @ model.to_body
         self.rows = u[:, -1:, None] * rows * model.load.spread

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,18 +40,6 @@ def baseline_style(index: int) -> dict[str, Any]:
 def default_labels(labels: Sequence[str] | None, letter: str, count: int) -> list[str]:
     """Return the labels, or q1 ... qN without any."""
     return list(labels) if labels else [f"{letter}{k + 1}" for k in range(count)]
-
-
-def units(labels: Sequence[str]) -> str:
-    """Return the units of labels such as ``Δx [rad]`` or ``q1 (rad)``, without repetition."""
-    matches = [re.search(r"[\[(]([^\[\]()]+)[\])]\s*$", label) for label in labels]
-    return ", ".join(dict.fromkeys(match[1] for match in matches if match))
-
-
-def with_unit(text: str, labels: Sequence[str]) -> str:
-    """Append the units of the labels to a text."""
-    unit = units(labels)
-    return f"{text} [{unit}]" if unit else text
 
 
 def panels(

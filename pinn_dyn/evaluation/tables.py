@@ -221,3 +221,15 @@ def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, frame.to_csv(index=False))
     return path
+
+
+def units(labels: Sequence[str]) -> str:
+    """Return the units of labels such as ``Δx [rad]`` or ``q1 (rad)``, without repetition."""
+    matches = [re.search(r"[\[(]([^\[\]()]+)[\])]\s*$", label) for label in labels]
+    return ", ".join(dict.fromkeys(match[1] for match in matches if match))
+
+
+def with_unit(text: str, labels: Sequence[str]) -> str:
+    """Append the units of the labels to a text."""
+    unit = units(labels)
+    return f"{text} [{unit}]" if unit else text

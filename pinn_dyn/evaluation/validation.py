@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import lightning as L
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
-from matplotlib.figure import Figure
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveFloat
 from torch import Tensor
 
+from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation.baselines import HoldPosition
-from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import compare_with_source
 from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, samples_of_window
 from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _HORIZON = 2.0  # s, of long trajectories
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
@@ -109,6 +110,29 @@ class RolloutValidator:
         """Return ``error_windowed`` of the quarters of K trajectories, ``(4 K,)``."""
         return self._windowed(model, truth, self.predict(model, truth), parts=4).flatten()
 
+    def figures(self, model: Predictor, source: DataSource, truth: Trajectory) -> dict[str, Figure]:
+        """Draw the rollout of the first trajectory, the errors and the learned terms."""
+        # Imports matplotlib.
+        from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
+
+        predictions = {type(model).__name__: self.predict(model, truth)}
+        figures = {
+            "rollout/trajectory": trajectory_figure(
+                truth.until(self.horizon),
+                predictions,
+                trajectory=0,
+                title=f"Validation trajectory 0, {self}",
+                labels=source.labels,
+                input_labels=source.input_labels,
+            ),
+            "rollout/error": error_figure(predictions, title=f"Validation error, {self}"),
+        }
+        if comparison := compare_with_source(model, source):
+            for k, name in enumerate(comparison.names):
+                title = f"Learned and true terms at {name}"
+                figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
+        return figures
+
     def _windowed(
         self, model: Predictor, truth: Trajectory, longest: Prediction, parts: int = 1
     ) -> Tensor:
@@ -146,50 +170,3 @@ class RolloutValidator:
             lags = [min(math.ceil(k * samples / _LAGS), last) for k in range(1, _LAGS + 1)]
             distances += [(item.q[lag:] - item.q[:-lag]).norm(dim=-1).mean() for lag in lags]
         return float(torch.stack(distances).mean()) if distances else 0.0
-
-
-class RolloutFigures(L.Callback):
-    """Figures of a validation rollout, its error and the learned terms in the training log."""
-
-    def __init__(self, *, every_n_validations: PositiveInt = 4):
-        self.every_n_validations = every_n_validations
-        self._validations = 0
-
-    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Draw at every n-th validation."""
-        self._validations += 1
-        if self._validations % self.every_n_validations == 0:
-            self._draw(trainer, pl_module)
-
-    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Draw the final model, unless the last validation did."""
-        if self._validations % self.every_n_validations:
-            self._draw(trainer, pl_module)
-
-    def _draw(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        datamodule = trainer.datamodule  # type: ignore[attr-defined]
-        (truth,) = list(datamodule.val_dataloader())
-        model, validator, source = pl_module.model, pl_module.validator, datamodule.source
-        assert isinstance(model, Predictor)
-        assert isinstance(validator, RolloutValidator)
-        predictions = {type(model).__name__: validator.predict(model, truth)}
-        figures: dict[str, Figure] = {
-            "rollout/trajectory": trajectory_figure(
-                truth.until(validator.horizon),
-                predictions,
-                trajectory=0,
-                title=f"Validation trajectory 0, {validator}",
-                labels=source.labels,
-                input_labels=source.input_labels,
-            ),
-            "rollout/error": error_figure(predictions, title=f"Validation error, {validator}"),
-        }
-        if comparison := compare_with_source(model, source):
-            for k, name in enumerate(comparison.names):
-                title = f"Learned and true terms at {name}"
-                figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
-        # The step at which Lightning logs the errors of the same validation.
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                for name, figure in figures.items():
-                    logger.experiment.add_figure(name, figure, trainer.global_step - 1)

@@ -39,7 +39,7 @@ def casadi_function(program: Program, name: str) -> casadi.Function:
     ca = import_casadi()
     graph = program.graph_module.graph
     inputs = [ca.MX.sym(key, shape.numel()) for key, shape in program.inputs.items()]
-    writer = _Writer(ca, dict(zip(graph.find_nodes(op="placeholder"), inputs, strict=True)))
+    writer = _CasadiWriter(ca, dict(zip(graph.find_nodes(op="placeholder"), inputs, strict=True)))
     for node in graph.nodes:
         if node.op == "get_attr":
             writer.values[node] = ca.MX(ca.DM(node.meta["val"].flatten().tolist()))
@@ -82,7 +82,7 @@ def write_casadi(functions: Sequence[Any], path: Path, info: str, real: str) -> 
     return {function.name: call}
 
 
-class _Writer:
+class _CasadiWriter:
     """The nodes of a program as columns of numbers, in the order of the rows of their tensors."""
 
     def __init__(self, ca: Any, values: dict[fx.Node, Any]):

@@ -50,7 +50,7 @@ def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, rea
             f"{path.name} needs {error.name}: pip install 'pinn_dyn[onnx]'"
         ) from error
     (function,) = functions
-    writer = _Writer(onnx.helper, np.float64 if real == "double" else np.float32)
+    writer = _OnnxWriter(onnx.helper, np.float64 if real == "double" else np.float32)
     graph = writer.graph(function)
     opset = onnx.helper.make_opsetid("", OPSET)
     model = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=8)
@@ -83,7 +83,7 @@ def _single(name: str) -> str:
     return f"{name} of a state"
 
 
-class _Writer:
+class _OnnxWriter:
     """The nodes of a program as nodes of ONNX, with their names."""
 
     def __init__(self, helper: Any, dtype: Any):

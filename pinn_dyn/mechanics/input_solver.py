@@ -75,7 +75,7 @@ class InputSolver:
             return self._solve(force, tau, typical, typical, all_steps)
         mu = torch.full_like(tau[..., :1], _SMALLEST)
         points = [_linear(force, torch.ones_like(tau), u) for u in (previous, typical)]
-        nearer = torch.lt(*(_norm(_step(x.J, tau - x.F, mu)) for x in points))
+        nearer = torch.lt(*(_norm(_damped_step(x.J, tau - x.F, mu)) for x in points))
         near, far = previous.where(nearer, typical), typical.where(nearer, previous)
         first = self._solve(force, tau, typical, near, all_steps)
         if not all_steps and bool(first.converged.all()):
@@ -127,12 +127,12 @@ class InputSolver:
         J, r, u = point.J, tau - point.F, point.u
         wide = J.shape[-1] > J.shape[-2]
         pull = _SMALLEST / mu * (typical - u) if wide else torch.zeros_like(u)
-        step = pull + _step(J, r - matvec(J, pull), mu)
+        step = pull + _damped_step(J, r - matvec(J, pull), mu)
         if self.low is None and self.high is None:
             return step
         free = self._clamped(u + step.sign()) != u
         pull = pull * free
-        return pull + _step(J * free.unsqueeze(-2), r - matvec(J, pull), mu)
+        return pull + _damped_step(J * free.unsqueeze(-2), r - matvec(J, pull), mu)
 
     def _clamped(self, u: Tensor) -> Tensor:
         low = -torch.inf if self.low is None else self.low
@@ -156,7 +156,7 @@ def _chosen(mask: Tensor, first: _Point, second: _Point) -> _Point:
     return _Point(u, F, first.J.where(mask.unsqueeze(-1), second.J))
 
 
-def _step(J: Tensor, r: Tensor, mu: Tensor) -> Tensor:
+def _damped_step(J: Tensor, r: Tensor, mu: Tensor) -> Tensor:
     """Return W J^T (J W J^T + mu |J W^(1/2)|^2 / N)^-1 r, with W = 1 until mu has grown.
 
     For M < N, this is (J^T J + mu |J|^2 / M)^-1 J^T r, which has no singular matrix.

@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+import scipy
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pinn_dyn.exports.escaping import xml_comment
@@ -99,7 +99,7 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
                 _remove(joint, "origin")
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # at a gimbal lock any angles are right
-                    rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")
+                    rpy = scipy.spatial.transform.Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")
                 ET.SubElement(joint, "origin", xyz=exact_text(pose[:3, 3]), rpy=exact_text(rpy))
             _remove(joint, *_OF_MOVING_JOINTS)
             joint.set("type", "fixed")
@@ -127,7 +127,8 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     actuators, equalities = (ET.SubElement(root, tag) for tag in ("actuator", "equality"))
     poses, bodies = tree.placements.numpy(), central_parameters(constants.inertia)
     for k, (pose, body) in enumerate(zip(poses, tree.bodies, strict=True)):
-        w, x, y, z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+        rotation = scipy.spatial.transform.Rotation.from_matrix(pose[:3, :3])
+        w, x, y, z = rotation.as_quat()[[3, 0, 1, 2]]
         frame = {"pos": exact_text(pose[:3, 3]), "quat": exact_text([w, x, y, z])}
         element = ET.SubElement(elements[tree.parents[k] + 1], "body", frame, name=body)
         elements.append(element)

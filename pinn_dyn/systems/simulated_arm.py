@@ -13,9 +13,9 @@ from typing import Annotated, ClassVar, Protocol
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+import scipy
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
-from scipy.spatial.transform import Rotation
 
 from pinn_dyn.systems.mjcf import exact_text
 from pinn_dyn.systems.rigid_chain import RigidChain
@@ -200,7 +200,7 @@ class SimulatedArm(RigidChain):
 
 def _principal_inertia(
     pseudo: np.ndarray, rotation: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray, Rotation]:
+) -> tuple[float, np.ndarray, np.ndarray, scipy.spatial.transform.Rotation]:
     """Return mass, centre, principal moments and principal axes of a body in a rotated frame."""
     mass = float(pseudo[3, 3])
     centre = pseudo[:3, 3] / mass
@@ -211,7 +211,12 @@ def _principal_inertia(
     first = int(np.abs(axes[2]).argmin())
     moments, axes = np.roll(moments, -first), np.roll(axes, -first, axis=1)
     axes[:, 2] *= math.copysign(1.0, np.linalg.det(axes))
-    return mass, rotation @ centre, np.maximum(moments, 0.0), Rotation.from_matrix(axes)
+    return (
+        mass,
+        rotation @ centre,
+        np.maximum(moments, 0.0),
+        scipy.spatial.transform.Rotation.from_matrix(axes),
+    )
 
 
 def _link(body: int) -> str:

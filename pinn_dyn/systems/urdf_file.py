@@ -12,8 +12,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial.transform import Rotation
 
 from pinn_dyn.systems.inertia import pseudo_inertia
 from pinn_dyn.systems.mjcf import mjcf_to_urdf
@@ -145,7 +145,9 @@ class UrdfFile:
         if name not in self.axes:
             position = 0.0
         if position and self.turns(name):
-            motion[:3, :3] = Rotation.from_rotvec(position * self.axes[name]).as_matrix()
+            motion[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(
+                position * self.axes[name]
+            ).as_matrix()
         elif position:
             motion[:3, 3] = position * self.axes[name]
         return self._poses[name] @ motion
@@ -207,7 +209,7 @@ def _pose(name: str, element: ET.Element, mistakes: list[str]) -> np.ndarray:
     """Return the ``<origin>`` of a joint or an ``<inertial>``, ``(4, 4)``."""
     pose = np.eye(4)
     rpy = _numbers(name, element, "origin", "rpy", "0 0 0", mistakes)
-    pose[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
+    pose[:3, :3] = scipy.spatial.transform.Rotation.from_euler("xyz", rpy).as_matrix()
     pose[:3, 3] = _numbers(name, element, "origin", "xyz", "0 0 0", mistakes)
     return pose
 

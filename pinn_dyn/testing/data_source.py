@@ -3,7 +3,14 @@
 import pytest
 import torch
 
-from pinn_dyn.data import DataSource, DynamicsData, data_changes, data_identity, draw_windows
+from pinn_dyn.data import (
+    DataSource,
+    DynamicsData,
+    LightningData,
+    data_changes,
+    data_identity,
+    draw_windows,
+)
 
 SPLITS = ("train", "validation", "test")
 
@@ -69,4 +76,4 @@ class DataSourceContract:
         data = DynamicsData(
             source, pairs=4, steps=2, stride=1, batch_size=2, batches_per_epoch=2, seed=0
         )
-        assert len(list(data.train_dataloader())) == 2
+        assert len(list(LightningData(data).train_dataloader())) == 2

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from pinn_dyn.lazy import lazy_attributes
-from pinn_dyn.training.constants_fit import COVARIANCE, FIT, Fit, StoppedFit
+from pinn_dyn.training.constants_fit import COVARIANCE, FIT, Fit
 from pinn_dyn.training.errors import NonFiniteLossError
 from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, Penalized, WindowLoss
@@ -14,7 +14,6 @@ from pinn_dyn.training.soap import SOAP
 if TYPE_CHECKING:
     from pinn_dyn.training.checkpoints import WholeCheckpoints
     from pinn_dyn.training.learner import DynamicsLearner
-    from pinn_dyn.training.least_squares_learner import LeastSquaresLearner
 
 __all__ = [
     "COVARIANCE",
@@ -25,12 +24,10 @@ __all__ = [
     "Fit",
     "IncrementLoss",
     "LeastSquares",
-    "LeastSquaresLearner",
     "MidpointLoss",
     "NonFiniteLossError",
     "ParameterVector",
     "Penalized",
-    "StoppedFit",
     "WholeCheckpoints",
     "WindowLoss",
     "one_cycle",

@@ -73,14 +73,6 @@ class Fit:
         return cls(prior=prior, **values)
 
 
-class StoppedFit(KeyboardInterrupt):
-    """Interrupt of a fit, with the result so far. The model has the best constants so far."""
-
-    def __init__(self, fit: Fit):
-        super().__init__()
-        self.fit = fit
-
-
 def posterior_covariance(information: Tensor, root: Tensor, scores: Tensor | None = None) -> Tensor:
     """Return the covariance of an estimate with the prior precision R^T R, ``(P, P)``::
 

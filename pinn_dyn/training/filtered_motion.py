@@ -12,7 +12,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import Trajectory
 
 
-class Motion(NamedTuple):
+class FilteredMotion(NamedTuple):
     """Samples of filtered motion, ``(K, N)`` each."""
 
     q: Tensor
@@ -21,7 +21,9 @@ class Motion(NamedTuple):
     u: Tensor
 
 
-def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
+def filtered_motion(
+    trajectories: Sequence[Trajectory], cutoff: float, samples: int
+) -> FilteredMotion:
     """Return at most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
 
     The Butterworth filter of fourth order runs forwards and backwards. a is the derivative of the
@@ -30,7 +32,7 @@ def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: 
     Raises:
         ValueError: if the cutoff is above half the sample rate, or all trajectories are too short.
     """
-    parts: list[Motion] = []
+    parts: list[FilteredMotion] = []
     for item in trajectories:
         rate = 1 / float(item.t[1] - item.t[0])
         if not cutoff < rate / 2:
@@ -50,13 +52,13 @@ def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: 
         near, far = v.roll(-1, 0) - v.roll(1, 0), v.roll(-2, 0) - v.roll(2, 0)
         a = (8 * near - far) * rate / 12
         edge = max(int(0.5 * rate / cutoff), 2)
-        parts.append(Motion(*(x[edge:-edge] for x in (q, v, a, u))))
+        parts.append(FilteredMotion(*(x[edge:-edge] for x in (q, v, a, u))))
     if not parts:
         longest = max(item.duration for item in trajectories)
         raise ValueError(
             f"least squares: the longest training trajectory has {longest:g} s, expected at least "
             f"three periods of the cutoff of {cutoff} Hz"
         )
-    joined = Motion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    joined = FilteredMotion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
     index = torch.linspace(0, len(joined.q) - 1, min(samples, len(joined.q))).long()
-    return Motion(*(x[index] for x in joined))
+    return FilteredMotion(*(x[index] for x in joined))

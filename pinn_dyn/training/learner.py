@@ -140,7 +140,11 @@ class DynamicsLearner(L.LightningModule):
             for logger in trainer.loggers:
                 logger.log_metrics(figures, self.global_step - 1)
         if before + done >= trainer.num_training_batches:
-            self.log_losses(torch.stack(self._losses).mean(0))
+            # The mean of the epoch, over the processes that share a batch.
+            means: Any = self.loss_figures(torch.stack(self._losses).mean(0))
+            self.log_dict(
+                means, logger=False, on_step=False, on_epoch=True, sync_dist=True, batch_size=1
+            )
 
     def _count_steps(self, done: int) -> None:
         """Count steps in the loop of Lightning, which has no public way to count several."""
@@ -205,11 +209,6 @@ class DynamicsLearner(L.LightningModule):
                     "reduce optimizer.lr, or use shorter windows (data.steps, data.stride)"
                 )
 
-    def log_losses(self, losses: Tensor) -> None:
-        """Record the mean loss of an epoch, over the processes that share a batch."""
-        options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
-        self.log_dict(self.loss_figures(losses), logger=False, batch_size=1, **options)
-
     def loss_figures(self, losses: Tensor) -> dict[str, Tensor]:
         """Return named figures of losses, ``()`` or one for each member of an ensemble."""
         return {"train/loss": losses.mean()}
@@ -234,7 +233,7 @@ class DynamicsLearner(L.LightningModule):
         weights = checkpoint["state_dict"]  # possibly averaged by a callback
         model = copy.deepcopy(self.model)
         model.load_state_dict({name.removeprefix("model."): x for name, x in weights.items()})
-        q = self.trainer.datamodule.windows.q  # type: ignore[attr-defined]
+        q = self.trainer.datamodule.data.windows.q  # type: ignore[attr-defined]
         limits = self.output_limits(model, q.to(next(model.parameters())))
         weights.update({f"model.{name}": limit for name, limit in limits.items()})
 

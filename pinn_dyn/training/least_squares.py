@@ -24,7 +24,6 @@ from pinn_dyn.training.constants_fit import (
     UNKNOWN,
     Fit,
     Prior,
-    StoppedFit,
     block_scores,
     doubtful_units,
     posterior_covariance,
@@ -126,6 +125,7 @@ class LeastSquares:
         covariance: Tensor | None = None,
         stopped: Fit | None = None,
         validate: Callable[[LearnedConstants], Tensor] | None = None,
+        keep: Callable[[Fit], None] = lambda _: None,
     ) -> Fit:
         """Fit the model in place. Its precision does not change.
 
@@ -136,11 +136,12 @@ class LeastSquares:
             covariance: covariance of the initial z from an earlier fit, ``(P, P)``, if any.
             stopped: interrupted result of this fit, to continue from the present z.
             validate: validation errors ``(V,)`` of a model, to compare the stages.
+            keep: function that saves the unfinished result and the present z of the model, called
+                between two stages and on an interrupt, with the best z of its stage.
 
         Raises:
             ValueError: if trajectories are too short for the filter, there are fewer residuals than
                 parameters, the covariance does not fit the model, or changed bodies are unknown.
-            StoppedFit: on an interrupt. The model then has the best z so far.
         """
         count = sum(p.numel() for p in model.parameters())
         precision = next(model.parameters()).dtype
@@ -190,12 +191,13 @@ class LeastSquares:
                 number += 1
                 if number >= planned and not grows:
                     break
-        except KeyboardInterrupt as interrupt:
+                keep(replace(best, stopped_in=number, identified=identified))
+        except (KeyboardInterrupt, SystemExit):
             zero = torch.zeros_like(prior.root)
             covariance = posterior_covariance(zero, prior.root)
-            partial_fit = best or Fit(covariance, zero, prior, float("nan"), 0)
-            partial_fit = replace(partial_fit, stopped_in=number, identified=identified)
-            raise StoppedFit(partial_fit) from interrupt
+            unfinished = best or Fit(covariance, zero, prior, float("nan"), 0)
+            keep(replace(unfinished, stopped_in=number, identified=identified))
+            raise
         finally:
             model.to(precision)
         assert best is not None

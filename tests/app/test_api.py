@@ -19,12 +19,12 @@ from scipy.signal import savgol_filter
 import pinn_dyn
 from pinn_dyn.app.config import composed
 from pinn_dyn.app.train import training_arguments
-from pinn_dyn.app.training import STEPS
-from pinn_dyn.app.training import _windows as default_windows
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.data.logs import InputDelay, MovingAverage
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import AccelerationMLP, LagrangianNetwork
+from pinn_dyn.run.training import STEPS
+from pinn_dyn.run.training import _windows as default_windows
 from tests.app.entry import ROOT, TINY_DATA, run_script
 
 Q = {"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]}
@@ -232,7 +232,7 @@ def test_a_named_model_is_that_of_the_command_line(name):
     """Equal weights of equal seeds, from the same statistics."""
     source = pinn_dyn.dataset("soft_arm_1", **dict(word[8:].split("=") for word in TINY_DATA))
     statistics = DynamicsData(source, stride=1, pairs=8, batch_size=8, batches_per_epoch=1, seed=0)
-    from pinn_dyn.app.training import MODELS
+    from pinn_dyn.run.training import MODELS
 
     configured = training_arguments(composed("train", [f"model={name}", "model_name=x"]), ROOT)
     weights = []
@@ -444,7 +444,7 @@ def test_a_log_is_fitted_in_every_form(monkeypatch, tmp_path, kind):
     forms = {"dict": runs, "list": list(runs.values()), "path": tmp_path / "my arm.csv"}
     forms["columns"] = {name: frame[name].to_numpy() for name in frame}
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pinn_dyn.app.fit.train", lambda source, *_, **__: sources.append(source))
+    monkeypatch.setattr("pinn_dyn.run.fit.train", lambda source, *_, **__: sources.append(source))
     column = "run" if kind in ("columns", "path") else None
     path = "my arm.csv" if kind == "path" else forms[kind]
     for form, run in ((frame, "run"), (path, column)):

@@ -2,9 +2,10 @@
 
 import pytest
 
-from pinn_dyn.app import trainer
-from pinn_dyn.app.config import ConfigError, build_part
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
+from pinn_dyn.run import trainer
+from pinn_dyn.run.build import build_part
+from pinn_dyn.run.validation import ConfigError
 
 
 @pytest.fixture

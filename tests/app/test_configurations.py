@@ -5,8 +5,8 @@ import json
 import pytest
 from hydra._internal.config_repository import ConfigRepository as Hydra
 
-from pinn_dyn.app.build import build_reference
 from pinn_dyn.app.config import CONF, composed
+from pinn_dyn.app.control import build_reference
 from pinn_dyn.systems import TendonArm
 from tests.app.entry import (
     NO_FIGURES,

@@ -9,10 +9,10 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import pinn_dyn
-from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.models import LagrangianNetwork
 from pinn_dyn.models.output_limits import free_weights
+from pinn_dyn.run.run_folder import load_run
 from tests.app.entry import NO_FIGURES, SET_POINTS, run_script, train
 
 

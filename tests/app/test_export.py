@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.app.export import export
-from pinn_dyn.app.run_folder import with_structures
 from pinn_dyn.models import KnownMechanics, LagrangianNetwork, NoFriction, Servo, Stribeck
+from pinn_dyn.run.export import export
+from pinn_dyn.run.run_folder import with_structures
 from pinn_dyn.systems import RigidChain
 from tests.support.arm_urdf import ARM
 from tests.support.known import elastic_model, statistics

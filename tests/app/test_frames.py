@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 import torch
 
-from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs import Deduplicate, InputDelay, InputRates, Resample, SubtractStart
+from pinn_dyn.run.predict_frame import predict_frame
 from tests.support.linear import unit_masses
 
 

@@ -7,10 +7,10 @@ from functools import partial
 import pytest
 import torch
 
-from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.known_data import check_known, match_model, match_structure
 from pinn_dyn.data import LogSource
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
+from pinn_dyn.run.known_data import check_known, match_model, match_structure
+from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.systems import RigidChain
 from tests.support.rigid_chains import joint, link, robot
 

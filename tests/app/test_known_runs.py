@@ -11,9 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 import pinn_dyn
 from pinn_dyn.systems import RigidChain
+from pinn_dyn.training import LeastSquares
 from tests.app.entry import NO_FIGURES, fork_script, refused_text, run_script
 from tests.support.recorded_logs import LOGS, ROOT, needs_logs
 
@@ -60,6 +63,18 @@ def test_a_run_contains_its_structure(fitted, capsys):
     words = [*KNOWN, f"model.structure.urdf={arm}", *SMALL, f"hydra.run.dir={fitted}"]
     text = " ".join(refused_text(capsys, "train.py", *words).split())
     assert re.search(r"another configuration: model.structure.urdf=\S+arm.urdf \w{8} \(there", text)
+
+
+def test_the_errors_and_settings_of_a_fit_are_logged(fitted):
+    record = json.loads((fitted / "metrics.json").read_text())
+    log = EventAccumulator(str(fitted / "tensorboard")).Reload()
+    for name in ("val/error_mean", "val/error_windowed", "train/loss"):
+        (scalar,) = log.Scalars(name)
+        assert (scalar.step, scalar.value) == (0, pytest.approx(record["validation"][name]))
+    content = log.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    start = HParamsPluginData.FromString(content).session_start_info
+    assert start.hparams["model_name"].string_value == "known"
+    assert start.hparams["data.pairs"].number_value == 20
 
 
 def test_what_the_motions_leave_open_is_counted(fitted):
@@ -196,7 +211,8 @@ def test_a_fit_that_the_data_refuse_ends_in_a_sentence(tmp_path, capsys, words, 
     assert re.search(message, refused_text(capsys, "train.py", *arguments))
 
 
-def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch, number):
     folder, begun, log = tmp_path / "run", tmp_path / "begun", tmp_path / "log.txt"
 
     def endless(*_):
@@ -211,17 +227,19 @@ def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
         try:
             while not begun.exists() and process.is_alive():
                 time.sleep(0.05)
-            os.kill(process.pid, signal.SIGTERM)
+            os.kill(process.pid, number)
             process.join(60)
         finally:
             process.kill()
     text = log.read_text()
-    assert process.exitcode == 128 + signal.SIGTERM, text
-    assert f"train.py resume={folder}" in text
+    if number == signal.SIGTERM:
+        assert process.exitcode == 128 + signal.SIGTERM, text
+        assert f"train.py resume={folder}" in text
     assert not (folder / "constants.csv").exists()
     assert not (folder / "metrics.json").exists()
     kept = constants(folder)
     assert max(float(value.abs().max()) for value in kept.values()) > 0.1
+    monkeypatch.setattr(LeastSquares, "_identify", lambda *_: pytest.fail("identified again"))
     run_script("train.py", f"resume={folder}")
     assert (folder / "constants.csv").exists()
     assert (folder / "metrics.json").exists()

@@ -1,8 +1,8 @@
 """Origin of the numbers in the reports of evaluate.py and control.py."""
 
 import pinn_dyn
-from pinn_dyn.app.provenance import data_hash
 from pinn_dyn.data import data_identity
+from pinn_dyn.run.provenance import data_hash
 from tests.app.entry import TINY_DATA
 
 

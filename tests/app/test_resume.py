@@ -98,9 +98,9 @@ def cut(run, name="last"):
 def test_a_resumed_training_equals_an_uninterrupted_one(run, tmp_path):
     assert not pinn_dyn.load(run).finished
     assert not (run / "metrics.json").exists()
-    callbacks = checkpoint(run)["callbacks"]
-    callbacks["Recorder"]["wall_seconds"] += 1000  # a long first part
-    change(run, callbacks=callbacks)
+    record = checkpoint(run)["record"]
+    record["training_seconds"] += 1000  # a long first part
+    change(run, record=record)
     resumed, whole = trained(run), trained(tmp_path / "whole")
     assert resumed.finished
     assert 1000 < resumed.metrics["training_seconds"] < 1600
@@ -116,7 +116,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(run, tmp_path):
 
 def test_a_finished_training_is_not_repeated(run, monkeypatch):
     finished = trained(run)
-    monkeypatch.setattr("pinn_dyn.app.training._fit", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr("pinn_dyn.run.training.prepare", lambda *_: pytest.fail("trained again"))
     assert trained(run).metrics == finished.metrics
     (run / "metrics.json").unlink()  # a copy
     assert trained(run).metrics == finished.metrics
@@ -217,7 +217,7 @@ def test_lightning_reads_no_code_from_a_checkpoint(command, monkeypatch):
     """Behind the check of the checkpoint, which is replaced here."""
     change(command, payload=Marker("was_here"))
     good = checkpoint(command, "best")
-    monkeypatch.setattr("pinn_dyn.app.run_folder.read_checkpoint", lambda path: good)
+    monkeypatch.setattr("pinn_dyn.run.run_folder.read_checkpoint", lambda path: good)
     with pytest.raises(UnpicklingError, match="Weights only load failed"):
         run_script("train.py", f"resume={command}")
     assert not os.path.exists("was_here")

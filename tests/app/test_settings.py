@@ -6,12 +6,12 @@ from typing import Annotated, Any
 import pytest
 from pydantic import Field, PositiveInt
 
-from pinn_dyn.app.config import ConfigError, checked, composed, config_folder
-from pinn_dyn.app.trainer import epochs
-from pinn_dyn.app.validation import check_arguments, check_value
+from pinn_dyn.app.config import checked, composed, config_folder
 from pinn_dyn.data.logs import Columns
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.models import CholeskyFactor
+from pinn_dyn.run.trainer import epochs
+from pinn_dyn.run.validation import ConfigError, check_arguments, check_value
 from tests.app.entry import refused_text
 from tests.support.composing import REQUIRED, compose
 

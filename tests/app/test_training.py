@@ -9,8 +9,8 @@ import pytest
 import torch
 import yaml
 
-from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.models.output_limits import free_weights
+from pinn_dyn.run.run_folder import load_run
 from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
 
 PLAIN = (str, int, float, bool, type(None))

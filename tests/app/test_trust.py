@@ -4,10 +4,12 @@ import re
 
 import pytest
 
-from pinn_dyn.app import trust
-from pinn_dyn.app.config import CONF, ConfigError, build_part
-from pinn_dyn.app.run_folder import load_run, read_checkpoint
+from pinn_dyn.app.config import CONF
 from pinn_dyn.data.logs import SubtractStart
+from pinn_dyn.run import trust
+from pinn_dyn.run.build import build_part
+from pinn_dyn.run.run_folder import load_run, read_checkpoint
+from pinn_dyn.run.validation import ConfigError
 from tests.app.entry import run_script
 from tests.support.foreign_runs import foreign
 

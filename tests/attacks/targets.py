@@ -31,7 +31,7 @@ def calls(mark):
         ("hydra.utils.instantiate", {"config": {"_target_": "os.mkdir", "path": mark}}),
         ("functools.partial", {"_args_": ["os.system", touch]}),
         ("importlib.import_module", {"name": "antigravity"}),
-        ("pinn_dyn.app.config.write_config", {"folder": mark, "config": {}}),
+        ("pinn_dyn.run.run_folder.write_config", {"folder": mark, "config": {}}),
         ("pinn_dyn.app.command.main", {"command": "train"}),
         ("pinn_dyn.data.cache.os.system", {"command": touch}),
         ("pinn_dyn.data.logs.source.Path.touch", {"self": mark}),

@@ -5,11 +5,11 @@ import shutil
 
 import pytest
 
-from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.gather import read_runs, read_test_errors
-from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.data import StoredSource, whole
+from pinn_dyn.evaluation.identification import read_constants
+from pinn_dyn.run.run_folder import load_run
+from pinn_dyn.run.validation import ConfigError
 
 
 def as_pipe(path):

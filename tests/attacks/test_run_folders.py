@@ -2,8 +2,8 @@
 
 import pytest
 
-from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.run_folder import load_run
+from pinn_dyn.run.run_folder import load_run
+from pinn_dyn.run.validation import ConfigError
 from tests.attacks.targets import calls
 from tests.support.foreign_runs import foreign
 

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from pinn_dyn.app.run_folder import load_run
+from pinn_dyn.run.run_folder import load_run
 from pinn_dyn.systems import RigidChain, robot_files
 from tests.support.foreign_runs import foreign
 from tests.support.simulated_arms import PENDULUM, SIMULATORS, simulated_by

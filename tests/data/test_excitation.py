@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pinn_dyn.data import Chirp, Mixture, MultiSine, Steps
-from pinn_dyn.data.excitation import joined
+from pinn_dyn.data.excitation import picked_signals
 
 OFFSET = np.array([0.5, -2.0])
 AMPLITUDE = np.array([1.0, 0.25])
@@ -54,7 +54,7 @@ def test_a_signal_is_a_function_of_time_alone(kind):
 
 def test_signals_of_several_draws_are_joined():
     draws = [KINDS["steps"].draw(4, DURATION, np.random.default_rng(k)) for k in range(2)]
-    signal = joined(draws, np.array([0, 1, 0]), np.array([3, 0, 3]))
+    signal = picked_signals(draws, np.array([0, 1, 0]), np.array([3, 0, 3]))
     expected = np.stack([draws[0](TIME)[3], draws[1](TIME)[0], draws[0](TIME)[3]])
     np.testing.assert_array_equal(signal(TIME), expected)
 

@@ -21,7 +21,7 @@ from pinn_dyn.data import (
     draw_windows,
 )
 from pinn_dyn.data.cache import load_or_make
-from pinn_dyn.data.robot_excitation import Plan
+from pinn_dyn.data.robot_excitation import DrawnMotion
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 from tests.support.processes import fork
@@ -245,7 +245,7 @@ class Push(RobotExcitation):
 
     def draw(self, robot, t, rngs):
         middle = np.tile((robot.q_low + robot.q_high) / 2, (len(rngs), 1))
-        return Plan(middle, 0 * middle, lambda k, q, v: 1000 * robot.u_max)
+        return DrawnMotion(middle, 0 * middle, lambda k, q, v: 1000 * robot.u_max)
 
 
 def test_motions_beyond_the_limits_are_given_up_by_joint(cache):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from pinn_dyn.data import DataSource, DynamicsData, Splits, draw_windows
+from pinn_dyn.data import DataSource, DynamicsData, LightningData, Splits, draw_windows
 from pinn_dyn.mechanics import Signal, Trajectory
 from tests.support.cart_pole import CartPole
 
@@ -195,7 +195,7 @@ def make_data(**changes):
 
 
 def test_training_batches_have_the_asked_shapes_in_single_precision():
-    loaded = list(make_data().train_dataloader())
+    loaded = list(LightningData(make_data()).train_dataloader())
     assert len(loaded) == 9
     for batch in loaded:
         assert batch.q.shape == (16, 2)
@@ -207,7 +207,7 @@ def test_training_batches_have_the_asked_shapes_in_single_precision():
 
 def test_batches_are_picked_on_the_device_that_trains():
     """The windows are moved once; a batch is where they are."""
-    data = make_data()
+    data = LightningData(make_data())
 
     class Strategy:
         root_device = torch.device("meta")
@@ -228,14 +228,14 @@ def test_windows_come_from_training_trajectories_alone():
     splits = data.source.splits
     found = origin([*splits.train, *splits.validation, *splits.test], data.windows)
     assert {number for number, _ in found} == {0, 1, 2}
-    served = torch.cat([batch.q for batch in data.train_dataloader()])
+    served = torch.cat([batch.q for batch in LightningData(data).train_dataloader()])
     train = torch.cat([x.q for x in splits.train]).float()
     assert (served[:, None] == train).all(-1).any(-1).all()
 
 
 def test_validation_is_one_batch_of_whole_trajectories():
     data = make_data()
-    (batch,) = data.val_dataloader()
+    (batch,) = LightningData(data).val_dataloader()
     assert torch.equal(batch.q, torch.stack([x.q for x in data.source.splits.validation]))
     assert batch.q.shape == (2, 40, 2)
 

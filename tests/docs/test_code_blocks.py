@@ -11,7 +11,8 @@ import matplotlib
 import pytest
 from hydra.errors import ConfigCompositionException
 
-from pinn_dyn.app.config import ConfigError, config_folder
+from pinn_dyn.app.config import config_folder
+from pinn_dyn.run.validation import ConfigError
 from tests.docs.blocks import PAGES, PLAYED, ROOT, blocks
 from tests.docs.commands import check_command, compose
 

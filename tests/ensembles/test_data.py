@@ -2,9 +2,8 @@
 
 import torch
 
-from pinn_dyn.data.windows import BatchSampler
-from pinn_dyn.ensembles import EnsembleData
-from pinn_dyn.ensembles.data import MemberSampler
+from pinn_dyn.data import LightningData
+from pinn_dyn.data.windows import BatchSampler, MemberSampler
 from tests.support.ensembles import make_data
 
 
@@ -24,8 +23,8 @@ def test_the_members_have_the_orders_of_their_own_seeds():
 
 def test_the_members_get_batches_of_the_same_windows():
     data = make_data()
-    both = list(EnsembleData(data, 2).train_dataloader())
-    single = list(data.train_dataloader())
+    both = list(LightningData(data, 2).train_dataloader())
+    single = list(LightningData(data).train_dataloader())
     assert len(both) == len(single) == 8
     for batch, first in zip(both, single, strict=True):
         assert batch.q.shape == (2, 32, 2)

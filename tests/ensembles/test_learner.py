@@ -5,8 +5,9 @@ import torch
 from torch.optim import LBFGS
 from torch.optim.lr_scheduler import ConstantLR
 
+from pinn_dyn.data import LightningData
 from pinn_dyn.data.windows import BatchSampler, WindowLoader
-from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
+from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.training import DynamicsLearner, NonFiniteLossError
 from tests.support.ensembles import learn, make_data, make_models, train
 from tests.support.training import make_trainer
@@ -34,7 +35,7 @@ def test_an_ensemble_of_two_ends_with_the_weights_of_two_trainings(tmp_path, kin
     ensemble = Ensemble(models)
     start = [p.detach().clone() for p in models[0].parameters()]
     learner = learn(EnsembleLearner, ensemble, models[0], data)
-    trainer = train(tmp_path, learner, EnsembleData(data, 2))
+    trainer = train(tmp_path, learner, LightningData(data, 2))
     losses = []
     for index in range(2):
         alone, loss = trained_alone(tmp_path, kind, make_data(), index)
@@ -59,7 +60,7 @@ def test_an_optimizer_that_would_mix_the_members_is_refused(tmp_path):
     learner = learn(EnsembleLearner, Ensemble(models), models[0], data, optimizer=LBFGS)
     learner._scheduler = lambda optimizer, total_steps: ConstantLR(optimizer)
     with pytest.raises(ValueError, match="optimizer is LBFGS, which mixes"):
-        train(tmp_path, learner, EnsembleData(data, 2))
+        train(tmp_path, learner, LightningData(data, 2))
 
 
 def test_one_member_that_breaks_stops_the_training(tmp_path):
@@ -69,7 +70,7 @@ def test_one_member_that_breaks_stops_the_training(tmp_path):
         next(models[1].parameters()).fill_(float("nan"))
     learner = learn(EnsembleLearner, Ensemble(models), models[0], data)
     with pytest.raises(NonFiniteLossError, match="became nan at step 0"):
-        train(tmp_path, learner, EnsembleData(data, 2))
+        train(tmp_path, learner, LightningData(data, 2))
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(
         train(
             tmp_path,
             learn(EnsembleLearner, ensemble, models[0], data, compile=compile),
-            EnsembleData(data, 2),
+            LightningData(data, 2),
         )
         weights.append(dict(ensemble.named_parameters()))
     for name, expected in weights[0].items():

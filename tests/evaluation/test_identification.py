@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.app.constants import write_constants
 from pinn_dyn.evaluation.identification import (
     common_factor,
     constants_table,
@@ -17,6 +16,7 @@ from pinn_dyn.evaluation.identification import (
 from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import AsymmetricCoulomb
+from pinn_dyn.run.fit_constants import write_constants
 from pinn_dyn.training import Fit
 from pinn_dyn.training.constants_fit import Prior
 from tests.support.known import known_model

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.app.export import export
 from pinn_dyn.exports import exported
 from pinn_dyn.exports.c_code import ELEMENTWISE, Constants
 from pinn_dyn.exports.exported import ExportedFunction, write
 from pinn_dyn.exports.model_functions import model_functions
+from pinn_dyn.run.export import export
 from tests.exports.test_formats import CONSTANT, MODELS
 from tests.models.builders import VARIANTS, make_structured, random_batch
 from tests.support.c_code import STRICT, compiled, function_of

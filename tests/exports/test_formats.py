@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.app.export import _within_domain
 from pinn_dyn.exports.casadi_function import casadi_function
 from pinn_dyn.exports.exported import write
 from pinn_dyn.exports.model_functions import model_functions
+from pinn_dyn.run.export import _within_domain
 from pinn_dyn.systems import RigidChain, SoftArm
 from tests.models.builders import CHAIN, NONLINEAR, VARIANTS, make_model, make_structured
 from tests.support.arm_urdf import ARM

@@ -8,10 +8,10 @@ import onnxruntime
 import pytest
 import torch
 
-from pinn_dyn.app.export import export
 from pinn_dyn.control import Actuator, Tracking, export_law
 from pinn_dyn.exports.exported import ExportedFunction, write
 from pinn_dyn.exports.model_functions import model_functions
+from pinn_dyn.run.export import export
 from tests.exports.test_c_file import Bessel
 from tests.exports.test_formats import CONSTANT, MODELS
 from tests.models.builders import random_batch

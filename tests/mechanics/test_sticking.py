@@ -10,13 +10,13 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from pinn_dyn.app.export import export
 from pinn_dyn.exports import c_loop
 from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
 from pinn_dyn.mechanics.compilation import Unrolled, integrated_by
 from pinn_dyn.mechanics.integrators import Sticking
 from pinn_dyn.models import CoulombFriction
+from pinn_dyn.run.export import export
 from pinn_dyn.testing import LinearSystem, assert_near, partial_derivatives
 from tests.support.known import elastic_model, known_model
 from tests.support.rigid_chains import TREE

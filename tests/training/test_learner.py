@@ -13,7 +13,7 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import OneCycleLR
 
-from pinn_dyn.data import DynamicsData
+from pinn_dyn.data import DynamicsData, LightningData
 from pinn_dyn.models import AccelerationMLP
 from pinn_dyn.training import (
     SOAP,
@@ -81,7 +81,9 @@ def test_a_short_training_lowers_the_loss(tmp_path, data, kind, optimizer):
     torch.manual_seed(0)
     learner = make_learner(MODELS[kind](data.statistics), data, optimizer=optimizer)
     before = loss_of(learner, data)
-    make_trainer(tmp_path, max_epochs=3, enable_checkpointing=False).fit(learner, data)
+    make_trainer(tmp_path, max_epochs=3, enable_checkpointing=False).fit(
+        learner, LightningData(data)
+    )
     assert loss_of(learner, data) < 0.5 * before
 
 
@@ -95,10 +97,10 @@ def test_the_logged_loss_is_that_of_the_batches(tmp_path, data, cut):
     learner = make_learner(AccelerationMLP(data.statistics, [8]), data, lr=0.0)
     if cut:
         options = {"max_epochs": 1, "max_steps": 5, "enable_checkpointing": False}
-        make_trainer(tmp_path, **options).fit(learner, data)
+        make_trainer(tmp_path, **options).fit(learner, LightningData(data))
     trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
-    trainer.fit(learner, data)
-    loader = data.train_dataloader()
+    trainer.fit(learner, LightningData(data))
+    loader = LightningData(data).train_dataloader()
     expected = []
     for batch in loader:
         with torch.no_grad():
@@ -119,7 +121,7 @@ def test_validation_figures_are_logged_by_name(tmp_path, data):
     model = AccelerationMLP(data.statistics, [8])
     learner = make_learner(model, data, validator)
     trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
-    trainer.fit(learner, data)
+    trainer.fit(learner, LightningData(data))
     assert float(trainer.callback_metrics["val/error_mean"]) == 0.25
     assert float(trainer.callback_metrics["val/diverged"]) == 3.0
     assert seen == [(model, (1, 101, 2))]
@@ -169,7 +171,7 @@ def test_a_loss_that_is_not_a_number_stops_the_training_and_keeps_the_checkpoint
     )
     trainer = make_trainer(tmp_path, max_epochs=4, callbacks=[checkpoint])
     with pytest.raises(NonFiniteLossError, match=r"became nan at step 70 \(epoch 2\)"):
-        trainer.fit(learner, data)
+        trainer.fit(learner, LightningData(data))
     for name in ("best", "last"):
         saved = torch.load(tmp_path / "checkpoints" / f"{name}.ckpt", weights_only=True)
         assert saved["global_step"] in (30, 60)
@@ -197,7 +199,7 @@ def trained(tmp_path, data, monkeypatch, seconds, **options):
     ends = Ends()
     options = {"log_every_n_steps": 20, "enable_checkpointing": False, **options}
     trainer = make_trainer(tmp_path, max_epochs=2, callbacks=[ends], **options)
-    trainer.fit(learner, data)
+    trainer.fit(learner, LightningData(data))
     return [p.detach().clone() for p in learner.model.parameters()], ends, trainer
 
 
@@ -232,7 +234,7 @@ def taught(tmp_path, data, compile, interrupted=None):
     learner._prepared_steps = stopped
     trainer = make_trainer(tmp_path, max_epochs=2, enable_checkpointing=False)
     with contextlib.suppress(SystemExit, KeyboardInterrupt):
-        trainer.fit(learner, data)
+        trainer.fit(learner, LightningData(data))
     (group,) = learner.optimizers(use_pl_optimizer=False).param_groups
     return learner, learner.lr_schedulers().last_epoch, group["lr"], group["betas"][0]
 
@@ -290,7 +292,7 @@ def test_weights_are_averaged_over_steps_not_over_their_blocks(tmp_path, data):
     trainer = make_trainer(
         tmp_path, max_epochs=1, callbacks=[average, Follows(averaged)], enable_checkpointing=False
     )
-    trainer.fit(learner, data)
+    trainer.fit(learner, LightningData(data))
     assert trainer.global_step == 30
     for one, two in zip(learner.model.parameters(), averaged, strict=True):
         torch.testing.assert_close(one.detach(), two)
@@ -313,4 +315,4 @@ def test_a_precision_that_scales_the_loss_is_refused(tmp_path, data):
     trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
     trainer.precision_plugin.scaler = object()
     with pytest.raises(ValueError, match="scales the loss: use bf16-mixed"):
-        trainer.fit(learner, data)
+        trainer.fit(learner, LightningData(data))

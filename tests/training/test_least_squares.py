@@ -16,7 +16,7 @@ from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.evaluation.identification import constants_table
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownSystem
-from pinn_dyn.training import LeastSquares, StoppedFit, least_squares
+from pinn_dyn.training import LeastSquares, least_squares
 from pinn_dyn.training.constants_fit import Fit, Prior
 from pinn_dyn.training.filtered_motion import filtered_motion
 from tests.support.known import known_model, motion, motions, statistics
@@ -265,13 +265,14 @@ def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
             raise KeyboardInterrupt
         return found
 
+    kept = []
     with monkeypatch.context() as patch:
         patch.setattr(least_squares, "_evaluate", interrupted)
-        with pytest.raises(StoppedFit) as stopped:
-            solver.fit(model, runs, windows)
+        with pytest.raises(KeyboardInterrupt):
+            solver.fit(model, runs, windows, keep=kept.append)
     count = sum(p.numel() for p in model.parameters())
-    fit = Fit.from_state(stopped.value.fit.state(), count)
-    assert fit.stopped_in == (0 if minimization == 1 else 2)
+    assert [fit.stopped_in for fit in kept] == ([0] if minimization == 1 else [1, 2, 2])
+    fit = Fit.from_state(kept[-1].state(), count)
     assert held_out_error(model, truth, unseen) < (1.001 if evaluation == 2 else 0.9) * before
     solved.clear()
     found = solver.fit(model, runs, windows, stopped=fit)
@@ -289,7 +290,7 @@ def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
     windows = draw_windows(runs, count=20, steps=4, stride=1, seed=0)
     noise = torch.randn(windows.v.shape, generator=torch.Generator().manual_seed(0)).double()
     windows = dataclasses.replace(windows, v=windows.v + 0.5 * noise)
-    errors, stopped = [], None
+    errors, kept, stopped = [], [], None
 
     def validate(model):
         errors.append(held_out_error(model, truth, unseen))
@@ -300,9 +301,9 @@ def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
     model, alone, solver = robot_model("generic"), robot_model("generic"), LeastSquares(cutoff=20.0)
     expected = LeastSquares(cutoff=20.0, rollouts=False).fit(alone, runs)
     if at:
-        with pytest.raises(StoppedFit) as stop:
-            solver.fit(model, runs, windows, validate=validate)
-        stopped = Fit.from_state(stop.value.fit.state(), sum(p.numel() for p in model.parameters()))
+        with pytest.raises(KeyboardInterrupt):
+            solver.fit(model, runs, windows, validate=validate, keep=kept.append)
+        stopped = Fit.from_state(kept[-1].state(), sum(p.numel() for p in model.parameters()))
     result = solver.fit(model, runs, windows, stopped=stopped, validate=validate)
     assert len(errors) == (4 if at else 3)
     assert errors[-1] > 2 * errors[0]

@@ -5,7 +5,8 @@ import copy
 import pytest
 import torch
 
-from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
+from pinn_dyn.data import LightningData
+from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.ensembles.gradients import CompiledMembers
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.mechanics import Signal, double_copy
@@ -81,7 +82,7 @@ def test_a_training_ends_with_the_weights_that_it_has_on_a_cpu(tmp_path, kind, c
         model = make_models(kind, data, 1)[0]
         compiled = compile and accelerator == "gpu"
         learner = learn(DynamicsLearner, model, model, data, compile=compiled)
-        train(tmp_path, learner, data, accelerator=accelerator)
+        train(tmp_path, learner, LightningData(data), accelerator=accelerator)
         ends.append([p.detach().cpu() for p in model.parameters()])
     for found, expected in zip(*ends, strict=True):
         # Adam divides by the size of a gradient: rounding counts where that is near zero.
@@ -96,7 +97,7 @@ def test_members_end_with_the_weights_that_they_have_on_a_cpu(tmp_path):
         ensemble = Ensemble(models)
         compiled = accelerator == "gpu"
         learner = learn(EnsembleLearner, ensemble, models[0], data, compile=compiled)
-        train(tmp_path, learner, EnsembleData(data, 2), accelerator=accelerator)
+        train(tmp_path, learner, LightningData(data, 2), accelerator=accelerator)
         ends.append([p.detach().cpu() for p in ensemble.parameters()])
     for found, expected in zip(*ends, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=2e-4)
@@ -144,4 +145,4 @@ def test_a_loss_that_is_not_a_number_is_found_though_the_steps_run_ahead(tmp_pat
     with torch.no_grad():
         next(model.parameters()).fill_(float("nan"))
     with pytest.raises(NonFiniteLossError, match="became nan at step 0"):
-        train(tmp_path, learner, data, accelerator="gpu")
+        train(tmp_path, learner, LightningData(data), accelerator="gpu")

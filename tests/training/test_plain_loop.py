@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.optim import AdamW
 
-from pinn_dyn.data import DynamicsData
+from pinn_dyn.data import DynamicsData, LightningData
 from pinn_dyn.training import DynamicsLearner, IncrementLoss, one_cycle
 from tests.support.training import MODELS, Oscillators, make_splits, make_trainer
 
@@ -39,7 +39,7 @@ def train(tmp_path, model, data, epochs):
         gradient_clip_val=1.0,
     )
     make_trainer(tmp_path, max_epochs=epochs, limit_val_batches=0, enable_checkpointing=False).fit(
-        learner, data
+        learner, LightningData(data)
     )
 
 
@@ -49,7 +49,7 @@ def plain_loop(model, data):
     optimizer = AdamW(model.parameters(), weight_decay=1e-5)
     total = EPOCHS * BATCHES
     rise = 0.05 * total - 1
-    loader = data.train_dataloader()
+    loader = LightningData(data).train_dataloader()
     for epoch in range(EPOCHS):
         loader.sampler.set_epoch(epoch)
         for k, batch in enumerate(loader):

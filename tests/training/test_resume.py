@@ -51,9 +51,9 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
         assert not (killed / "metrics.json").exists()
         cut = torch.load(last, weights_only=True)
         assert cut["global_step"] == KILLED // BATCHES * BATCHES
-        took = cut["callbacks"]["Recorder"]
-        assert 0 < took["wall_seconds"] < 600
-        took["wall_seconds"] += 1000  # as if it had been long
+        took = cut["record"]
+        assert 0 < took["training_seconds"] < 600
+        took["training_seconds"] += 1000  # as if it had been long
         torch.save(cut, last)
         logs = set(killed.rglob("events.out.tfevents.*"))
         process = fork_script("train.py", f"resume={killed}", **at)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_opening, gaussian_filter1d
+import scipy
 
 from pinn_dyn.data.logs.recording import Recording
 
@@ -132,7 +132,9 @@ def averages(
     x: np.ndarray, samples: float, step: float = 1.0, order: int = 0, cut: float = CUT
 ) -> np.ndarray:
     """Return averages of x by a Gaussian kernel of this width, or their slopes of an order."""
-    return gaussian_filter1d(x, samples, axis=0, order=order, truncate=cut) / step**order
+    return (
+        scipy.ndimage.gaussian_filter1d(x, samples, axis=0, order=order, truncate=cut) / step**order
+    )
 
 
 def white_noise(x: np.ndarray) -> np.ndarray:
@@ -157,7 +159,7 @@ def signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
     high = np.percentile(np.abs(v), 95, axis=0)
     slow = np.maximum(_SLOW * high, 3 * spread).clip(min=1e-300)
     shortest = max(round(_REST / step), 3)  # a reversal of v is no rest
-    still = binary_opening(np.abs(v) < slow, np.ones((shortest, 1)))
+    still = scipy.ndimage.binary_opening(np.abs(v) < slow, np.ones((shortest, 1)))
     sign = np.tanh(v / slow)
     falls = [np.exp(-((v / np.maximum(x * high, slow)) ** 2)) for x in _STRIBECK]
     return sign, np.hstack([sign * x for x in falls]), still.astype(float)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
@@ -139,7 +139,9 @@ def check_rows(
 
 def _check_angle(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.ndarray) -> None:
     steps = np.diff(q)
-    slow = np.abs(median_filter(steps, 3)) < math.pi  # a fast motor turns so far in each row
+    slow = (
+        np.abs(scipy.ndimage.median_filter(steps, 3)) < math.pi
+    )  # a fast motor turns so far in each row
     wraps = np.flatnonzero(in_step & slow & (np.abs(np.abs(steps) - 2 * math.pi) < 0.3))
     if unit == "rad" and len(wraps):
         row = int(wraps[0])
@@ -165,7 +167,7 @@ def _jumps(
 ) -> str:
     steps = signal == "q"
     value = np.where(in_step, np.diff(x), 0.0) if steps else x - np.median(x)
-    smooth = median_filter(value, _NEIGHBORS, mode="nearest")
+    smooth = scipy.ndimage.median_filter(value, _NEIGHBORS, mode="nearest")
     usual = np.abs(smooth[smooth != 0])
     if len(usual) < 100:  # a signal that is still, or moves in a few steps
         return ""

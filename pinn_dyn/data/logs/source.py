@@ -34,7 +34,7 @@ from pinn_dyn.mechanics import Interpolation
 log = logging.getLogger(__name__)
 
 
-class _Loaded(NamedTuple):
+class _LoadedLog(NamedTuple):
     splits: Splits
     names: dict[str, list[str]]
     cleaned: list[Cleaned]
@@ -214,7 +214,7 @@ class LogSource(DataSource):
         return Layout(self.time, self._signals, self.trajectory, self.long, request, self._repairs)
 
     @cached_property
-    def _loaded(self) -> _Loaded:
+    def _loaded(self) -> _LoadedLog:
         report = Report(self.name)
         recordings = self._layout.read(self.files, self.root, report)
         measurements = report.measurements
@@ -258,4 +258,4 @@ class LogSource(DataSource):
             name: [trajectory(item, step, self.interpolation) for item in items]
             for name, items in rollouts.items()
         }
-        return _Loaded(Splits(**splits), names, cleaned, report)
+        return _LoadedLog(Splits(**splits), names, cleaned, report)

@@ -10,7 +10,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.closed_loops import ControlResult
-from pinn_dyn.evaluation.plots import units
 from pinn_dyn.evaluation.report.page import (
     Origin,
     Section,
@@ -22,6 +21,7 @@ from pinn_dyn.evaluation.report.page import (
     picture,
     table,
 )
+from pinn_dyn.evaluation.tables import units
 
 _HEADERS = {
     "controller": "law",

@@ -14,11 +14,17 @@ from matplotlib.figure import Figure
 
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.evaluation.calibration import Calibration, calibration_figure
-from pinn_dyn.evaluation.figures import ERROR, error_figure, terms_figure, trajectory_figure
+from pinn_dyn.evaluation.calibration import Calibration
+from pinn_dyn.evaluation.figures import (
+    ERROR,
+    calibration_figure,
+    error_figure,
+    terms_figure,
+    trajectory_figure,
+)
 from pinn_dyn.evaluation.identification import OPEN
 from pinn_dyn.evaluation.learned_terms import TermComparison
-from pinn_dyn.evaluation.plots import save, with_unit
+from pinn_dyn.evaluation.plots import save
 from pinn_dyn.evaluation.prediction import Prediction
 from pinn_dyn.evaluation.report.page import (
     Section,
@@ -34,6 +40,7 @@ from pinn_dyn.evaluation.tables import (
     summary_columns,
     to_text,
     unbeaten_baselines,
+    with_unit,
     write_table,
 )
 from pinn_dyn.mechanics import Trajectory

@@ -7,7 +7,7 @@ import pkgutil
 from collections.abc import Sequence
 from typing import Any
 
-from pinn_dyn.app.validation import ConfigError, places
+from pinn_dyn.run.validation import ConfigError, places
 from pinn_dyn.systems.urdf_file import is_mjcf
 
 _PACKAGES = (

@@ -7,17 +7,17 @@ from collections.abc import Mapping, Sequence
 
 from torch.nn.utils import vector_to_parameters
 
-from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.constants import read_constants
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import flattened, require_same_data
 from pinn_dyn.data import DataSource, LogSource, data_changes, data_identity
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
+from pinn_dyn.evaluation.identification import read_constants
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
 from pinn_dyn.mechanics import double_copy, stack_until
 from pinn_dyn.progress import Progress
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.run_folder import flattened, require_same_data
+from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.training.least_squares import IDENTIFICATION
 
 log = logging.getLogger(__name__)

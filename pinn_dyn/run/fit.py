@@ -9,12 +9,12 @@ from typing import Any
 import pandas as pd
 from pydantic import PositiveInt
 
-from pinn_dyn.app.build import ModelBuilder
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.training import train
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.mechanics import Predictor
+from pinn_dyn.run.build import ModelBuilder
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.training import train
 
 Signals = str | Sequence[str] | Mapping[str, Any]
 

@@ -18,9 +18,6 @@ from numpy.typing import ArrayLike
 from pydantic import PositiveInt
 from torch import Tensor
 
-from pinn_dyn.app.build import build_source
-from pinn_dyn.app.export import export
-from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
@@ -38,6 +35,9 @@ from pinn_dyn.mechanics import (
 )
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
+from pinn_dyn.run.build import build_source
+from pinn_dyn.run.export import export
+from pinn_dyn.run.predict_frame import predict_frame
 
 TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""
@@ -160,7 +160,7 @@ class Run:
             store(self._made_in_python, target / TRAJECTORIES)
 
     def export(self, path: str | Path, what: str | None = None, *, real: Real = "double") -> Path:
-        """Write the model to a C, ONNX, CasADi, URDF or MJCF file, see :func:`~.app.export.export`.
+        """Write the model to a C, ONNX, CasADi, URDF or MJCF file, see :func:`~.run.export.export`.
 
         Args:
             path: the file; its ending selects the format.

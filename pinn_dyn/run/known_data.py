@@ -10,12 +10,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from pinn_dyn.app.build import ModelBuilder
-from pinn_dyn.app.config import ConfigError
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.evaluation.structure_check import compare_structure
-from pinn_dyn.mechanics import Predictor, double_copy
-from pinn_dyn.models import KnownAndNetwork, KnownMechanics
+from pinn_dyn.mechanics import double_copy
+from pinn_dyn.models import KnownMechanics
+from pinn_dyn.run.build import ConfigError, ModelBuilder
 from pinn_dyn.systems import RigidChain
 
 log = logging.getLogger(__name__)
@@ -133,11 +132,8 @@ def _number(name: str) -> float:
     return float(digits[-1]) if digits else math.nan
 
 
-def check_known(model: Predictor, source: DataSource) -> None:
+def check_known(model: KnownMechanics, source: DataSource) -> None:
     """Refuse known mechanics of other joints, or for inputs such as currents without gains."""
-    model = model.known if isinstance(model, KnownAndNetwork) else model
-    if not isinstance(model, KnownMechanics):
-        return
     names = model.structure.joint_names
     driven = [names[k] for k in model.driven]
     (key, q), *_, (input_key, u) = _signals(source)
@@ -164,10 +160,9 @@ def check_known(model: Predictor, source: DataSource) -> None:
             )
 
 
-def warn_of_structure(model: Predictor, source: DataSource) -> None:
+def warn_of_structure(model: KnownMechanics, source: DataSource) -> None:
     """Warn if the URDF of known mechanics contradicts the log, with the likely cause."""
-    model = model.known if isinstance(model, KnownAndNetwork) else model
-    if not isinstance(model, KnownMechanics) or not isinstance(source, LogSource) or model.servo:
+    if not isinstance(source, LogSource) or model.servo:
         return
     size = len(source.u.columns)
     training = [item for x in source.cleaned if x.split == "train" for item in x.clean]

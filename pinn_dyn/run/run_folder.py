@@ -13,23 +13,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from filelock import FileLock, Timeout
 
 from pinn_dyn import __version__
-from pinn_dyn.app.build import ModelBuilder, build_predictor, model_builder
-from pinn_dyn.app.config import ConfigError, write_config
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.trust import is_trusted, packages, require_trusted
 from pinn_dyn.data import data_changes
 from pinn_dyn.data.whole import save_whole, write_whole
 from pinn_dyn.evaluation.tables import short
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import set_output_limits
+from pinn_dyn.run.build import ConfigError, ModelBuilder, build_predictor, model_builder
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.trust import is_trusted, packages, require_trusted
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
 from pinn_dyn.training import COVARIANCE, FIT
 
+CONFIG = "config.yaml"
 METRICS, CHECKPOINTS = "metrics.json", "checkpoints"
 RECORD, DATA, FINISHED = "record", "data", "finished"
 """Keys of a checkpoint: metrics of the training, identity of the data, end of the training."""
@@ -278,3 +279,9 @@ def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         section = isinstance(value, Mapping) and value
         flat |= flattened(value, f"{prefix}{key}.") if section else {f"{prefix}{key}": short(value)}
     return flat
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    """Write the resolved configuration of a run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))

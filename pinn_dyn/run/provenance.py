@@ -8,19 +8,21 @@ import platform
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import torch
 import yaml
 
 from pinn_dyn import __version__
-from pinn_dyn.app.run import Run
-from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data import DataSource, data_identity
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.evaluation.report.page import Origin
+from pinn_dyn.run.program import command_line
+from pinn_dyn.run.run import Run
+
+if TYPE_CHECKING:
+    from pinn_dyn.evaluation.report.page import Origin
 
 
 def data_hash(identity: Mapping[str, Any]) -> str:
@@ -50,6 +52,8 @@ def write_provenance(
     folder: Path,
 ) -> Origin:
     """Write ``provenance.json``, and return the origin of results for a report."""
+    from pinn_dyn.evaluation.report.page import Origin  # imports matplotlib
+
     record = {"command": command_line(), "data_hash": data_hash(data_identity(source))}
     record |= provenance()
     rows = [

@@ -1,9 +1,9 @@
-"""Trainer, learner and record of a training."""
+"""Training of networks by the trainer of Lightning."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,34 +14,29 @@ import torch
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
+from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from pinn_dyn.app.config import ConfigError, naming
-from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD, flattened
+from pinn_dyn.data import LightningData
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
-from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
 from pinn_dyn.evaluation.metrics import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
 from pinn_dyn.progress import Progress
-from pinn_dyn.training import (
-    DynamicsLearner,
-    LeastSquares,
-    LeastSquaresLearner,
-    WholeCheckpoints,
-    WindowLoss,
-)
+from pinn_dyn.run.build import ConfigError, naming
+from pinn_dyn.run.prepared import PreparedTraining
+from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
+from pinn_dyn.training import DynamicsLearner, WholeCheckpoints, WindowLoss
 
 LONGEST_EPOCH = 1000
 """Largest number of steps between two writes of the last checkpoint."""
 LOSSES = 50
 """Smallest number of losses in the log of a training, if it has as many steps."""
-_COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
-"""Beginnings of the settings that TensorBoard shows beside the validation error."""
 CLIPPING = ("gradient_clip_val", "gradient_clip_algorithm")
 """Arguments of the trainer that the learner takes instead."""
 
@@ -52,7 +47,7 @@ def build_learner(
     validator: RolloutValidator,
     *,
     loss: Callable[..., WindowLoss],
-    optimizer: Callable[..., Optimizer] | LeastSquares,
+    optimizer: Callable[..., Optimizer],
     scheduler: Callable[..., LRScheduler],
     config: dict[str, Any],
     compile: bool,
@@ -62,21 +57,19 @@ def build_learner(
     with naming("loss"):
         single = model.member(0) if isinstance(model, Ensemble) else model
         window_loss = loss(statistics=statistics, model=single)
-    common: dict[str, Any] = dict(
-        loss=window_loss, validator=validator, config=config, statistics=statistics
-    )
+    learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
     with naming("optimizer"):
-        if isinstance(optimizer, LeastSquares):
-            common |= dict(solver=optimizer, part_errors=validator.part_errors)
-            return LeastSquaresLearner(model, **common)  # type: ignore[arg-type]
-        learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
-        common |= dict(optimizer=optimizer, scheduler=scheduler, compile=compile)
-        return learner(model, **common, **clipping)
-
-
-def even_validations(steps: int, limit: int) -> int:
-    """Return the largest number of validations, up to ``limit``, that divides the steps."""
-    return max(count for count in range(1, limit + 1) if steps % count == 0)
+        return learner(
+            model,
+            loss=window_loss,
+            optimizer=optimizer,
+            scheduler=scheduler,
+            validator=validator,
+            config=config,
+            statistics=statistics,
+            compile=compile,
+            **clipping,
+        )
 
 
 def epochs(steps: int, validations: int) -> tuple[int, int, int]:
@@ -145,9 +138,7 @@ class _ProgressLines(L.Callback):
         config = pl_module.hparams["config"]
         task = f"training {config['name']} seed {config['seed']}"
         steps = config["trainer"]["steps"]
-        # A least-squares fit is a single step, and logs its evaluations itself.
-        silent = isinstance(pl_module, LeastSquaresLearner) or not trainer.is_global_zero
-        self.progress = Progress(None if silent else task, steps, "steps")
+        self.progress = Progress(task if trainer.is_global_zero else None, steps, "steps")
         self.progress.__enter__()
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
@@ -219,39 +210,88 @@ def tensorboard(folder: Path) -> TensorBoardLogger:
 
 
 class Recorder(L.Callback):
-    """Run time of a training, its metrics and the identity of its data, for its checkpoints."""
+    """Record of a training and the identity of its data, for its checkpoints and TensorBoard."""
 
-    def __init__(self, facts: dict[str, Any], identity: Mapping[str, Any]):
-        self.facts, self.identity = facts, identity
-        self._started = time.perf_counter()
-
-    def state_dict(self) -> dict[str, float]:
-        return {"wall_seconds": time.perf_counter() - self._started}
-
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        self._started = time.perf_counter() - state_dict["wall_seconds"]
-
-    def record(self, trainer: L.Trainer, model: torch.nn.Module, steps: int) -> dict[str, Any]:
-        """Return the record of the run so far."""
-        return {
-            **self.facts,
-            "parameters": sum(p.numel() for p in model.parameters()),
-            "training_seconds": time.perf_counter() - self._started,
-            "steps": steps,
-            "validation": {key: float(x) for key, x in trainer.callback_metrics.items()},
-        }
+    def __init__(self, training: PreparedTraining):
+        self.training = training
 
     def on_save_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Add the record and the identity."""
-        checkpoint[RECORD] = self.record(trainer, pl_module, trainer.global_step)
-        checkpoint[DATA] = self.identity
+        checkpoint[RECORD] = self.training.record(trainer.global_step, trainer.callback_metrics)
+        checkpoint[DATA] = self.training.identity
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Log settings and the validation error for the tab HPARAMS of TensorBoard."""
-        config, error = pl_module.hparams["config"], trainer.callback_metrics.get(VALIDATION_ERROR)
-        settings = {key: x for key, x in flattened(config).items() if key.startswith(_COMPARED)}
+        error = trainer.callback_metrics.get(VALIDATION_ERROR)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger) and error is not None:
+                settings = self.training.compared_settings()
                 logger.log_hyperparams(settings, {"hp/validation_error": float(error)})
+
+
+@isolate_rng()
+def train_network(
+    prepare: Callable[..., PreparedTraining],
+    *,
+    folder: Path,
+    checkpoint: Path | None,
+    seed: int,
+    length: tuple[int, int],
+    compile: bool | Literal["auto"],
+    settings: Mapping[str, Any],
+    parts: Mapping[str, Any],
+    callbacks: Sequence[L.Callback] | None,
+    loggers: Sequence[Logger] | None,
+) -> None:
+    """Train a model from its start or a checkpoint, and write the run.
+
+    Args:
+        prepare: function that prepares model and data, called with ``batches=``.
+        folder: the run folder.
+        checkpoint: the checkpoint of an interrupted training, if any.
+        seed: seed of all random generators.
+        length: steps and validations.
+        compile: true to compile the dynamics.
+        settings: arguments of :class:`lightning.Trainer`.
+        parts: builders of loss, optimizer and schedule.
+        callbacks, loggers: as in :func:`~pinn_dyn.train`.
+    """
+    # A missing compiler or device is refused before data are simulated.
+    compiled = compiles(compile, length[0], settings)
+    if callbacks is None:
+        callbacks = [RolloutFigures(every_n_validations=4)]
+    if loggers is None:
+        loggers = [tensorboard(folder)]
+    count = epochs(*length)
+    trainer = build_trainer(folder, settings, callbacks, loggers, count)
+    L.seed_everything(seed, verbose=False)
+    training = prepare(batches=count[1])
+    model, windows = training.model, training.windows
+    if windows.batch_size % trainer.world_size:
+        text = f"batch_size {windows.batch_size} is no multiple of {trainer.world_size} devices"
+        raise ConfigError(f"data: {text}")
+    clipping = {key: settings[key] for key in CLIPPING if key in settings}
+    learner = build_learner(
+        model,
+        windows.statistics,
+        training.validator,
+        **parts,
+        config=training.config,
+        compile=compiled,
+        clipping=clipping,
+    )
+    trainer.callbacks.insert(0, Recorder(training))  # type: ignore[attr-defined]
+    data = LightningData(windows, model.size if isinstance(model, Ensemble) else None)
+    try:
+        # The optimizer of an ensemble is built inside of fit.
+        with naming("optimizer") if isinstance(model, Ensemble) else contextlib.nullcontext():
+            trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
+        if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
+            trainer.validate(learner, data, verbose=False)
+    except SystemExit as stop:  # Lightning's end of an interrupted training
+        raise KeyboardInterrupt from stop
+    # Other processes have counted the steps of theirs.
+    done = read_checkpoint(folder / CHECKPOINTS / "last.ckpt")["global_step"]
+    training.finish(training.record(done, trainer.callback_metrics))

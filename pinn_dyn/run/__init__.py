@@ -1,0 +1,1 @@
+"""Runs in Python, without Hydra: train, load, evaluate and export models in run folders."""

@@ -1,0 +1,96 @@
+"""Objects that a configuration describes, part by part."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import os
+import pkgutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import torch
+
+from pinn_dyn.data import DataSource
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models import Statistics
+from pinn_dyn.run.validation import ConfigError, check_value
+
+ModelBuilder = Callable[..., Predictor]
+"""Builder of a model, called with ``statistics=``."""
+
+
+def build_source(config: dict[str, Any]) -> DataSource:
+    """Build the data source of ``config["dataset"]``; a simulated one gets the cache folder."""
+    part = config["dataset"]
+    if "cache" in inspect.signature(pkgutil.resolve_name(part["_target_"])).parameters:
+        part = {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn"), **part}
+    return build_part("dataset", part)
+
+
+def model_builder(config: dict[str, Any]) -> ModelBuilder:
+    """Return the builder of ``config["model"]``."""
+    if config["model"] is None:
+        raise ConfigError("the model was built in Python: use pinn_dyn.load(folder, model=builder)")
+    return build_part("model", config["model"], partial_=True)
+
+
+def build_predictor(
+    model: ModelBuilder | Predictor, statistics: Statistics, seed: int, ensemble: int = 1
+) -> Predictor:
+    """Build the model, or an ensemble of models of the seeds seed, seed + 1, ..."""
+    if isinstance(model, Predictor):
+        return model
+    if ensemble == 1:
+        return model(statistics=statistics)
+    members = []
+    for k in range(ensemble):
+        torch.manual_seed(seed + k)
+        members.append(model(statistics=statistics))
+    return Ensemble(members)
+
+
+@contextlib.contextmanager
+def naming(part: str) -> Iterator[None]:
+    """Name the part of the configuration that an error is about."""
+    try:
+        yield
+    except Exception as error:
+        # The class of Lightning is compared by name, since the import takes seconds.
+        of_lightning = type(error).__name__ == "MisconfigurationException"
+        if isinstance(error, ConfigError) or not (
+            of_lightning or isinstance(error, TypeError | ValueError)
+        ):
+            raise
+        raise ConfigError(f"{part}: {error}") from error
+
+
+def build_part(
+    name: str, config: dict[str, Any], /, *arguments: Any, partial_: bool = False, **extra: Any
+) -> Any:
+    """Build the object that a part of the configuration describes; ``name`` is its path.
+
+    The program adds ``arguments`` and ``extra``, or takes a factory with ``partial_``. A
+    ConfigError names the argument that does not fit, or has the message of the constructor.
+    """
+    check_value(name, config)
+    try:
+        maker = _built({**config, "_partial_": True})
+        return maker if partial_ else maker(*arguments, **extra)
+    except Exception as error:  # constructors may raise anything
+        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{name}: {reason}") from error
+
+
+def _built(part: Any) -> Any:
+    if isinstance(part, list):
+        return [_built(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    values = {k: _built(x) for k, x in part.items() if k not in ("_target_", "_partial_")}
+    if "_target_" not in part:
+        return values
+    maker = partial(pkgutil.resolve_name(part["_target_"]), **values)
+    return maker if part.get("_partial_") else maker()

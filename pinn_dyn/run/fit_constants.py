@@ -1,0 +1,239 @@
+"""Training of physical constants: a least-squares fit in a run folder."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pinn_dyn import evaluation
+from pinn_dyn.data import DataSource
+from pinn_dyn.data.whole import save_whole, write_whole
+from pinn_dyn.evaluation.identification import (
+    CONSTANTS,
+    common_factor,
+    constants_table,
+    contradicted,
+    undetermined,
+)
+from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
+from pinn_dyn.evaluation.tables import units
+from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
+from pinn_dyn.models import KnownMechanics, LearnedConstants
+from pinn_dyn.run.build import ConfigError, naming
+from pinn_dyn.run.prepared import PreparedTraining
+from pinn_dyn.run.run import Run
+from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
+from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
+
+log = logging.getLogger(__name__)
+
+_SHOWN = 2  # directions in the log
+_MOVE = "Move {} at more frequencies, poses and speeds. excite.py designs such a motion."
+_NO_MOTION = (
+    "Other constants act on the joints only in sums with further ones, or not at all. No motion "
+    "determines them one by one, and no prediction depends on it. Their `known` in constants.csv "
+    "is small."
+)
+_SCALE = (
+    "The data determine all constants per drive gain only. Their common factor is held by the "
+    "priors, to within a factor of {:.2g} (95 %). If the gains are known, set model.drive_gain and "
+    "model.gain_spread=0. If a body is known, set a small prior for it, as "
+    "'model.spread={{default: 3, {}: 0.01}}'."
+)
+
+
+def fit_constants(
+    prepare: Callable[..., PreparedTraining],
+    solver: LeastSquares,
+    saved: Mapping[str, Any],
+    start_from: Run | None,
+    callbacks: Sequence[Any] | None,
+    loggers: Sequence[Any] | None,
+) -> None:
+    """Fit the constants of a model, and write the run.
+
+    The constants are saved between the stages of the fit and on an interrupt. The next call
+    continues from them.
+
+    Args:
+        prepare: function that prepares model and data, called with ``batches=``.
+        solver: the least-squares solver.
+        saved: content of the checkpoint of an interrupted fit; empty without one.
+        start_from: an earlier fit, whose covariance becomes the prior.
+        callbacks: callbacks of a training, of which only the figures of rollouts are used.
+        loggers: loggers of Lightning; None writes a TensorBoard log.
+
+    Raises:
+        ConfigError: if the parameters of the model are not physical constants, or the solver cannot
+            use the data.
+        KeyboardInterrupt: on an interrupt, from the SystemExit that ends the program.
+    """
+    training = prepare(batches=1)
+    model, windows = training.model, training.windows
+    truth = stack_until(windows.splits.validation)
+
+    def keep(unfinished: Fit) -> None:
+        _save("last", training, unfinished, training.record(0, {}))
+
+    try:
+        with naming("optimizer"), _sigterm_exits():
+            result = _fitted(training, solver, truth, saved, start_from, keep)
+    except (KeyboardInterrupt, SystemExit) as stop:
+        raise KeyboardInterrupt from stop if isinstance(stop, SystemExit) else SystemExit(1)
+    keep(result)
+    with torch.no_grad():
+        errors = training.validator(model.eval(), truth)
+    metrics = {f"val/{name}": error for name, error in errors.items()}
+    metrics["train/loss"] = result.residual**2
+    record = training.record(1, metrics, stage=result.stage)
+    for name in ("best", "last"):
+        _save(name, training, result, record)
+    _write_log(training, truth, metrics, callbacks, loggers)
+    runs = windows.splits.train
+    write_constants(model, result, windows.source, training.folder, runs, solver.cutoff)
+    training.finish(record)
+
+
+def _fitted(
+    training: PreparedTraining,
+    solver: LeastSquares,
+    truth: Trajectory,
+    saved: Mapping[str, Any],
+    start_from: Run | None,
+    keep: Callable[[Fit], None],
+) -> Fit:
+    """Fit the model, or continue the interrupted fit of a checkpoint."""
+    model, data, result = training.model, training.windows, None
+    if not isinstance(model, LearnedConstants):
+        raise TypeError(
+            "least squares fits physical constants (model=known or known_system), not "
+            f"{type(model).__name__}: use optimizer=adamw"
+        )
+    if saved:
+        model.load_state_dict({k.removeprefix("model."): x for k, x in saved["state_dict"].items()})
+    if FIT in saved:
+        result = Fit.from_state(saved[FIT], sum(p.numel() for p in model.parameters()))
+    if result is not None and result.stopped_in is None:
+        return result
+    covariance = None if start_from is None else start_from.covariance
+    if start_from is not None and covariance is None:
+        raise ConfigError("start_from: the run has no covariance of its constants")
+    errors = torch.no_grad()(partial(training.validator.part_errors, truth=truth))
+    return solver.fit(model, data.splits.train, data.windows, covariance, result, errors, keep)
+
+
+@contextlib.contextmanager
+def _sigterm_exits() -> Iterator[None]:
+    """Raise SystemExit on SIGTERM within a context, in the main thread."""
+    if threading.current_thread() is not threading.main_thread():  # which alone receives signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _save(name: str, training: PreparedTraining, result: Fit, record: dict[str, Any]) -> None:
+    """Write a checkpoint with the entries that :func:`~.run_folder.load_run` reads."""
+    statistics = training.windows.statistics.to_dict()
+    content = {
+        "state_dict": {f"model.{key}": x for key, x in training.model.state_dict().items()},
+        "hyper_parameters": {"config": training.config, "statistics": statistics},
+        "global_step": record["steps"],
+        COVARIANCE: result.covariance,
+        FIT: result.state(),
+        RECORD: record,
+        DATA: training.identity,
+    }
+    path = training.folder / CHECKPOINTS / f"{name}.ckpt"
+    path.parent.mkdir(exist_ok=True)
+    save_whole(path, content)
+
+
+def _write_log(
+    training: PreparedTraining,
+    truth: Trajectory,
+    metrics: Mapping[str, float],
+    callbacks: Sequence[Any] | None,
+    loggers: Sequence[Any] | None,
+) -> None:
+    """Log metrics, and to TensorBoard settings and the figures of rollouts."""
+    from torch.utils.tensorboard import SummaryWriter  # takes half a second
+
+    # Without callbacks, the module of the figures and Lightning are not imported.
+    draws = [isinstance(x, evaluation.RolloutFigures) for x in callbacks or ()]
+    figures = {}
+    if callbacks is None or any(draws):
+        figures = training.validator.figures(training.model, training.windows.source, truth)
+    for logger in loggers or ():
+        logger.log_metrics(metrics, 0)
+    writers = [getattr(logger, "experiment", None) for logger in loggers or ()]
+    boards = [writer for writer in writers if isinstance(writer, SummaryWriter)]
+    if loggers is None:
+        boards = [SummaryWriter(str(training.folder / "tensorboard"))]
+        for name, value in metrics.items():
+            boards[0].add_scalar(name, value, 0)
+    for board in boards:
+        error = {"hp/validation_error": metrics[VALIDATION_ERROR]}
+        board.add_hparams(training.compared_settings(), error, run_name=".", global_step=0)
+        for name, figure in figures.items():
+            board.add_figure(name, figure, 0)
+        board.close()
+    for logger in loggers or ():
+        logger.finalize("success")
+
+
+def write_constants(
+    model: Predictor,
+    result: Fit,
+    source: DataSource,
+    folder: Path,
+    runs: Sequence[Trajectory],
+    cutoff: float,
+) -> None:
+    """Write the constants with 95 % intervals, and the ones that the data do not determine.
+
+    The motions ``runs``, filtered at ``cutoff`` Hz, determine the same combinations of the
+    constants of rigid bodies as in the check of a log.
+    """
+    assert isinstance(model, LearnedConstants)
+    table = constants_table(model, result, [units([label]) for label in source.input_labels])
+    path = folder / CONSTANTS
+    write_whole(path, table.to_csv(index=False, float_format="%.4g"))
+    log.info("constants and their intervals are in %s", path)
+    remarks = []
+    if isinstance(model, KnownMechanics):
+        excitation = rigid_excitation(double_copy(model).structure, runs, cutoff=cutoff)
+        lines = [x for x in excitation.undetermined.split("; ") if x != "none"]
+        head = (
+            f"{len(lines)} of {excitation.count} base parameters are not determined by the motions"
+        )
+        if lines:
+            remarks.append(_MOVE.format(", ".join(excitation.open_joints)))
+        remarks.append(_NO_MOTION)
+        if model.gain is not None:
+            body = model.structure.body_names[-1]
+            remarks.append(_SCALE.format(common_factor(model, result), body))
+    else:
+        lines = undetermined(model, result)
+        head = f"{len(lines)} of {len(table)} directions of the constants are held by the prior"
+    conflicts = contradicted(model, result)
+    path = folder / "undetermined.md"
+    parts = [f"{head}.", "\n".join(f"- {x}" for x in lines), *conflicts, *remarks]
+    write_whole(path, "\n\n".join(filter(None, parts)) + "\n")
+    if lines:
+        log.warning("%s, see %s: %s ...", head, path, "; ".join(lines[:_SHOWN]))
+    for text in conflicts:
+        log.warning(text)

@@ -1,0 +1,335 @@
+"""Training in Python: built objects in, a trained run out."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from pydantic import PositiveInt
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from pinn_dyn.data import DataSource, DynamicsData, LogSource
+from pinn_dyn.data.cache import cache_key
+from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models import (
+    AccelerationMLP,
+    CoupledOscillators,
+    HamiltonianNetwork,
+    LagrangianNetwork,
+    NextStateMLP,
+    SubspaceEncoder,
+)
+from pinn_dyn.run.build import ModelBuilder
+from pinn_dyn.run.described import described
+from pinn_dyn.run.fit_constants import fit_constants
+from pinn_dyn.run.known_data import match_model
+from pinn_dyn.run.prepared import prepare, same_data
+from pinn_dyn.run.program import hush
+from pinn_dyn.run.run import TRAJECTORIES, Run
+from pinn_dyn.run.run_folder import (
+    CHECKPOINTS,
+    FINISHED,
+    claimed,
+    load_run,
+    merged,
+    with_structures,
+)
+from pinn_dyn.spelling import did_you_mean
+from pinn_dyn.training import IncrementLoss, LeastSquares, MidpointLoss, WindowLoss, one_cycle
+
+if TYPE_CHECKING:
+    from lightning import Callback
+    from lightning.pytorch.loggers import Logger
+
+MODELS: dict[str, ModelBuilder] = {
+    "lnn": LagrangianNetwork,
+    "hnn": HamiltonianNetwork,
+    "acceleration": AccelerationMLP,
+    "mlp": partial(NextStateMLP, activation="silu"),
+    "subnet": SubspaceEncoder,
+    "oscillators": CoupledOscillators,
+}
+"""Models by their names in conf/model."""
+LOSSES: dict[str, Callable[..., WindowLoss]] = {
+    "increment": IncrementLoss,
+    "midpoint": MidpointLoss,
+}
+"""Losses by their names in conf/loss."""
+ADAMW = partial(AdamW, lr=0.005, weight_decay=1e-5, fused=True)
+TRAINER = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
+STEPS, LOG_STEPS = 20_000, 1000
+"""Default steps of the optimizer on simulated data and on a log."""
+_PAIRS, _BATCH = 10_000, 128  # at most, of a log
+_WINDOW, _STEP = 2, 0.02  # steps of a training window of a log, and their length in s
+_FEW_PAIRS, _LONG_WINDOW = (
+    150,
+    10,
+)  # pairs for least squares, and steps for it, subnet and oscillators
+_HISTORY = 0.5  # s of the past, for subnet
+_COLUMNS = [
+    "name",
+    "time",
+    "q",
+    "u",
+    "v",
+    "trajectory",
+    "steps",
+    "delay",
+    "interpolation",
+    "angles",
+]
+
+log = logging.getLogger(__name__)
+
+
+def train(
+    source: DataSource,
+    model: str | ModelBuilder | Predictor,
+    *,
+    loss: str | Callable[..., WindowLoss] = IncrementLoss,
+    optimizer: Callable[..., Optimizer] | LeastSquares = ADAMW,
+    scheduler: Callable[..., LRScheduler] = one_cycle,
+    data: Callable[..., DynamicsData] | None = None,
+    validator: Callable[..., RolloutValidator] = RolloutValidator,
+    steps: PositiveInt | None = None,
+    validations: PositiveInt | None = None,
+    seed: int = 0,
+    ensemble: PositiveInt = 1,
+    compile: bool | Literal["auto"] = "auto",
+    threads: PositiveInt = 1,
+    trainer: Mapping[str, Any] = TRAINER,
+    callbacks: Sequence[Callback] | None = None,
+    loggers: Sequence[Logger] | None = None,
+    start_from: Run | None = None,
+    folder: str | Path | None = None,
+    overwrite: bool = False,
+    model_name: str | None = None,
+    config: Mapping[str, Any] | None = None,
+) -> Run:
+    """Train a model on the data of a source, and return the run with the best checkpoint.
+
+    Builders are classes or :func:`functools.partial` of them, without the arguments of the data::
+
+        model=partial(LagrangianNetwork, mass=partial(NetworkCholesky, hidden=[64, 64]))
+        data=partial(DynamicsData, steps=10, stride="20 ms", pairs=4000)
+        optimizer=partial(torch.optim.AdamW, lr=0.002)
+
+    A folder with an interrupted training of the same data and arguments is resumed, and a finished
+    one is loaded. A folder with another training is refused.
+
+    Args:
+        source: the data.
+        model: builder, called with ``statistics=``; or ``"lnn"``, ``"hnn"``, ``"acceleration"``,
+            ``"mlp"``, ``"subnet"`` or ``"oscillators"``; or a built predictor, which is trained in
+            place.
+        loss: builder, called with ``statistics=`` and ``model=``; or ``"increment"`` or
+            ``"midpoint"``.
+        optimizer: builder, called with the parameters; or a least-squares fit.
+        scheduler: builder, called with the optimizer and ``total_steps=``.
+        data: builder of the training windows, called with ``source=``; None takes windows of two
+            steps of about 20 ms from a log (ten for least squares, subnet and oscillators), and the
+            defaults of :class:`~pinn_dyn.data.DynamicsData` from other sources.
+        validator: builder of the validation, called with ``training_step=``.
+        steps: steps of the optimizer; None takes 1,000 on a log and 20,000 on other sources.
+        validations: number of validations, a divisor of ``steps``; None takes up to 10 on a log
+            and up to 4 on other sources.
+        seed: seed of the weights and of the order of the windows.
+        ensemble: number of models trained at once, with the seeds seed, seed + 1, ...
+        compile: compile the dynamics; ``"auto"`` does in long trainings if there is a compiler.
+        threads: CPU threads; small networks are fastest with one.
+        trainer: arguments of :class:`lightning.Trainer`, which least squares does not use.
+        callbacks: callbacks; None draws figures of rollouts if there is a folder.
+        loggers: loggers; None writes a TensorBoard log to the folder.
+        start_from: a run whose weights the training starts from.
+        folder: the run folder; None uses a temporary one, see :meth:`Run.save`.
+        overwrite: replace the run in the folder, if any.
+        model_name: short name of the model for tables; None takes that of ``model``.
+        config: description of the run that its checkpoint keeps; None describes the arguments.
+
+    Raises:
+        ValueError: if the data, the model or the settings do not fit together, or the folder holds
+            a training of other data or arguments.
+        NonFiniteLossError: if the loss becomes NaN or infinite.
+        KeyboardInterrupt: if the training was interrupted; its last checkpoint is kept.
+    """
+    temporary = None
+    if folder is None:
+        temporary = TemporaryDirectory(prefix="pinn_dyn-")
+        folder, callbacks = temporary.name, callbacks or ()
+    run_folder = Path(folder).expanduser()
+    steps, validations, trainer = _length(source, optimizer, steps, validations, trainer)
+    data = data or _windows(source, model, optimizer)
+    model, model_name = _builder(source, model, model_name)
+    model, changes = match_model(model, source)
+    loss = _by_name("loss", loss, LOSSES)
+    made_in_python = config is None
+    if config is None:
+        parts = dict(data=data, loss=loss, optimizer=optimizer, scheduler=scheduler)
+        settings = dict(seed=seed, compile=compile, ensemble=ensemble, threads=threads)
+        start = {} if start_from is None else {"start_from": str(start_from.folder)}
+        length = {"steps": steps, "validations": validations}
+        config = _description(source, model, model_name, parts | {"validator": validator})
+        config |= {**settings, **start, "trainer": {**length, **trainer}}
+    config = merged(with_structures(config), {"model": changes} if changes else {})
+    try:
+        with _isolated(threads), claimed(run_folder, config, overwrite) as (checkpoint, saved):
+            prepare_now = partial(
+                prepare,
+                source=source,
+                model=model,
+                data=data,
+                validator=validator,
+                config=config,
+                folder=run_folder,
+                stores=made_in_python and temporary is None,
+                saved=saved,
+                start_from=start_from,
+            )
+            if saved.get(FINISHED):
+                same_data(source, run_folder, saved)
+                log.info("already trained: %s is loaded; overwrite=True trains again", run_folder)
+            elif isinstance(optimizer, LeastSquares):
+                fit_constants(prepare_now, optimizer, saved, start_from, callbacks, loggers)
+            else:
+                from pinn_dyn.run.trainer import train_network  # imports Lightning
+
+                train_network(
+                    prepare_now,
+                    folder=run_folder,
+                    checkpoint=checkpoint,
+                    seed=seed,
+                    length=(steps, validations),
+                    compile=compile,
+                    settings=trainer,
+                    parts=dict(loss=loss, optimizer=optimizer, scheduler=scheduler),
+                    callbacks=callbacks,
+                    loggers=loggers,
+                )
+    except KeyboardInterrupt:
+        way = _way_on(run_folder, temporary is not None, overwrite)
+        # Without the frames of Lightning; the cause of the context is its exit, if any.
+        raise KeyboardInterrupt(f"the training was interrupted: {way}") from None
+    # The builder of a built model gives a model for the weights of the checkpoint.
+    builder = (lambda statistics: copy.deepcopy(model)) if isinstance(model, Predictor) else model
+    run = load_run(run_folder, "best", trust=None, model=builder)
+    return replace(run, _made_in_python=source if made_in_python else None, _temporary=temporary)
+
+
+@contextlib.contextmanager
+def _isolated(threads: int) -> Iterator[None]:
+    """Restore the number of threads and the random numbers of PyTorch after a training."""
+    with contextlib.ExitStack() as stack:
+        stack.callback(torch.set_num_threads, torch.get_num_threads())
+        stack.enter_context(torch.random.fork_rng(range(torch.cuda.device_count())))
+        torch.set_num_threads(threads)
+        hush()
+        yield
+
+
+def _way_on(folder: Path, is_temporary: bool, overwrite: bool) -> str:
+    """Return how an interrupted training goes on."""
+    if is_temporary:
+        return "its steps are lost; with folder=... the same call would resume it"
+    if not (folder / CHECKPOINTS / "last.ckpt").is_file():
+        return "nothing is saved yet, the same call starts again"
+    return f"the same call resumes it from {folder}" + " without overwrite" * overwrite
+
+
+def _length(
+    source: DataSource,
+    optimizer: Any,
+    steps: int | None,
+    validations: int | None,
+    trainer: Mapping[str, Any],
+) -> tuple[int, int, dict[str, Any]]:
+    """Return steps, validations and further settings of the trainer; a fit is a single step."""
+    if isinstance(optimizer, LeastSquares):
+        return 1, 1, {key: x for key, x in trainer.items() if not key.startswith("gradient_clip")}
+    is_log = isinstance(source, LogSource)
+    steps = steps or (LOG_STEPS if is_log else STEPS)
+    return steps, validations or even_validations(steps, 10 if is_log else 4), dict(trainer)
+
+
+def _builder(source: DataSource, model: Any, name: str | None) -> tuple[Any, str | None]:
+    """Return the builder of a model that may be a name, and its short name."""
+    if not isinstance(model, str):
+        return model, name
+    builder = _by_name("model", model, MODELS)
+    if model == "hnn" and isinstance(source, LogSource):  # a log has no momenta
+        builder = partial(builder, state="qv")
+    return builder, name or model
+
+
+def _by_name(kind: str, value: Any, names: Mapping[str, Any]) -> Any:
+    """Return the builder of a name, or the value if it is no name."""
+    if not isinstance(value, str):
+        return value
+    if value not in names:
+        expected = f", expected {', '.join(names)} or a builder like partial(KnownMechanics, ...)"
+        raise ValueError(f"{kind} is {value!r}{did_you_mean(value, names) or expected}")
+    return names[value]
+
+
+def _windows(source: DataSource, model: Any, optimizer: Any) -> Callable[..., DynamicsData]:
+    """Return the builder of the default windows."""
+    if not isinstance(source, LogSource):
+        return DynamicsData
+    t = source.load().train[0].t
+    stride = max(round(_STEP / float(t[1] - t[0])), 1)
+    few = isinstance(optimizer, LeastSquares)
+    pairs, steps = (_FEW_PAIRS, _LONG_WINDOW) if few else (_PAIRS, _WINDOW)
+    batch = min(_BATCH, pairs)
+    windows = partial(DynamicsData, pairs=pairs, steps=steps, stride=stride, batch_size=batch)
+    if model == "subnet":
+        return partial(windows, history=_HISTORY, steps=_LONG_WINDOW)
+    return partial(windows, steps=_LONG_WINDOW) if model == "oscillators" else windows
+
+
+def _model_description(model: Any) -> dict[str, Any]:
+    """Describe a builder, or a built model by a hash of all but its learned parameters."""
+    if not isinstance(model, Predictor):
+        return {"model": described(model)}
+    shapes = {name: list(value.shape) for name, value in model.named_parameters()}
+    fixed = {name: value.tolist() for name, value in model.named_buffers()}
+    return {
+        "model": None,
+        "built": cache_key([type(model).__qualname__, repr(model), shapes, fixed]),
+    }
+
+
+def _description(
+    source: DataSource, model: Any, name: str | None, parts: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Describe a training in Python; its trajectories are stored in the run folder."""
+    factory = model.func if isinstance(model, partial) else model
+    name = name or getattr(factory, "__name__", type(factory).__name__)
+    stored = {
+        "_target_": "pinn_dyn.data.StoredSource",
+        "path": TRAJECTORIES,
+        "name": source.name,
+        "labels": list(source.labels),
+        "input_labels": list(source.input_labels),
+        "angles": list(source.angles),
+        "delay": source.input_delay.tolist(),
+    }
+    config = {"name": f"{source.name}/{name}", "model_name": name, "dataset": stored}
+    if isinstance(source, LogSource):
+        # Columns and cleaning, for predictions along a data frame.
+        columns = {key: described(getattr(source, key)) for key in _COLUMNS}
+        config["log"] = {"_target_": "pinn_dyn.data.LogSource", "files": "*", **columns}
+    return config | _model_description(model) | {key: described(x) for key, x in parts.items()}
+
+
+def even_validations(steps: int, limit: int) -> int:
+    """Return the largest number of validations, up to ``limit``, that divides the steps."""
+    return max(count for count in range(1, limit + 1) if steps % count == 0)
