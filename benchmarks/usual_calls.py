@@ -28,7 +28,7 @@ import torch
 from long_rollout import FINGERS, PANDA, STEP, models_of
 from torch import Tensor
 
-from pinn_dyn.app.provenance import provenance
+from pinn_dyn.run.provenance import provenance
 from pinn_dyn.envs import ModelPlant, RobotEnv, RobotVectorEnv
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports import c_loop
