@@ -25,6 +25,7 @@ from pinn_dyn.run.run_folder import load
 
 try:
     import gymnasium
+    from gymnasium.vector import AutoresetMode
 except ImportError as error:
     text = "pinn_dyn.envs needs Gymnasium: pip install 'pinn_dyn[envs]'"
     raise ImportError(text) from error
@@ -42,8 +43,7 @@ _SAMPLES = 200  # states per trajectory
 class ModelPlant(Plant):
     """K copies of a learned robot, integrated as in its training; inputs are zero before the start.
 
-    A loop in C is used from the start of the motion after which it pays off, see
-    :class:`~pinn_dyn.exports.c_loop.CLoop`.
+    A loop in C is used as soon as it pays off, see :class:`~pinn_dyn.exports.c_loop.CLoop`.
 
     Args:
         model: the learned system.
@@ -68,15 +68,12 @@ class ModelPlant(Plant):
         self._model, self._step, self._threads = self._models[0], step, threads
         self._delay = torch.zeros(model.num_inputs) if delay is None else delay
         self._loop: Loop | None = None
+        self._has_draws_in_c = True
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
         self._x = self._states(q0, v0, torch.ones(len(q0)).bool())
         self._inputs = [q0.new_zeros(len(q0), self.num_inputs)]
-        if len(self._models) == 1:
-            integrator = cast(CLoop, self._model.integrator)
-            self._loop = integrator.ready(self._model, self._x, self._step)
-        elif self._loop is None:
-            self._loop = self._loop_of_draws()
+        self._loop = self._ready()
 
     def restart(self, chosen: Tensor, q0: Tensor, v0: Tensor) -> None:
         """Put the chosen copies ``(K,)`` into new states ``(k, N)``, with inputs of zero before."""
@@ -88,6 +85,7 @@ class ModelPlant(Plant):
         longest = max(self._delay.tolist(), default=0.0)
         self._inputs = [*self._inputs, u][-(math.ceil(longest / duration) + 1) :]
         count = math.ceil(duration / self._step - 1e-6)
+        self._loop = self._loop or self._ready()
         if self._loop is None or longest > 0:
             self._x = self._x + self._path(duration, count)
         else:
@@ -136,13 +134,21 @@ class ModelPlant(Plant):
                     v[rows] = model.velocity(q[rows], p[rows])
         return q, v
 
-    def _loop_of_draws(self) -> Loop | None:
+    def _ready(self) -> Loop | None:
+        if len(self._models) == 1:
+            integrator = cast(CLoop, self._model.integrator)
+            return integrator.ready(self._model, self._x, self._step)
+        if not self._has_draws_in_c:
+            return None
+        if self._loop is not None:
+            return self._loop
         stages, h = len(self._model.integrator.nodes), self._x.new_tensor(self._step)
         inputs = self._x.new_zeros(stages, self.num_inputs)
         try:
             return LoopOfDraws(self._models, len(self._x), self._x[0], inputs, h)
         except Exception:  # from a head that cannot be traced, a compiler or a full disk
             log.info("no loop in C for draws of %s", type(self._model).__name__, exc_info=True)
+            self._has_draws_in_c = False
             return None
 
 
@@ -281,8 +287,9 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     r"""K robots that are integrated side by side, with the interface of Gymnasium.
 
     Each robot is a :class:`RobotEnv`, with the same observations, rewards and ends. Episodes end at
-    different times, and a robot starts a new one in the step after its last
-    (``AutoresetMode.NEXT_STEP``). ``distances()`` returns the distances from the training data.
+    different times. A robot starts a new one in the step after its last, or at once with
+    ``AutoresetMode.SAME_STEP``, where ``infos["final_obs"]`` holds the last observation.
+    ``distances()`` returns the distances from the training data.
 
     Args:
         robot: a run or its folder, a mechanical system, or a plant of K robots.
@@ -292,6 +299,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         draws: models with other constants, as ``run.sample`` returns them: robot k is draw
             ``k % len(draws)``. They need a run. None for K copies of the model.
         threads: number of threads that share the robots of a run.
+        autoreset: when a robot starts again.
 
     Raises:
         TypeError: if the model is not a mechanical system, ``data`` is missing, or ``draws`` are
@@ -311,6 +319,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         u_high: Sequence[float] | None = None,
         draws: Sequence[MechanicalSystem] | None = None,
         threads: PositiveInt = 1,
+        autoreset: AutoresetMode = AutoresetMode.NEXT_STEP,
     ):
         task = _Task(robot, data, step, (u_low, u_high), draws, threads)
         if not isinstance(task.plant, ModelPlant):
@@ -324,7 +333,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )
-        self.metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}
+        self.metadata = {"autoreset_mode": autoreset}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -360,7 +369,12 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
             self._restart(ended)
         truncated = self._count >= self.steps
         self._is_over = diverged | truncated
-        return self._observations(), rewards, diverged, truncated, {}
+        infos: dict[str, Any] = {}
+        if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP and self._is_over.any():
+            infos = {"final_obs": self._observations(), "_final_obs": self._is_over}
+            self._restart(self._is_over)
+            self._is_over = np.zeros_like(diverged)
+        return self._observations(), rewards, diverged, truncated, infos
 
     def distances(self) -> np.ndarray:
         """Return the distances ``(K,)`` of the states from the training data, 1 at the edge."""

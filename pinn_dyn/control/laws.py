@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import hashlib
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
+from pinn_dyn.exports.c_loop import rows_in_c
 from pinn_dyn.mechanics import InputSolver, MechanicalSystem
 from pinn_dyn.mechanics.arrays import (
     jacobians,
@@ -95,11 +97,30 @@ class ModelBasedLaw(Controller):
         if previous is not None and previous.shape[:-1] != q.shape[:-1]:
             previous = None
         with torch.no_grad():
-            u, A, self._solution = self._input(q, v, reference, previous)
+            if self.model.input_affine and type(self).__module__ == __name__:
+                u, A = self._affine_input(q, v, reference)
+            else:
+                u, A, self._solution = self._input(q, v, reference, previous)
             self._condition = condition_number(A)
         if not self.model.input_affine:
             self._previous = u
         return u
+
+    def _affine_input(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
+        """Return u and A for a force that is linear in u, in C if that pays off."""
+        rows = torch.cat([x.expand_as(q) for x in (q, v, *reference)], dim=-1)
+
+        def function(x: Tensor) -> Tensor:
+            q, v, *motion = x.chunk(5, dim=-1)
+            u, A, _ = self._input(q, v, Motion(*motion), None)
+            return torch.cat([u, A.flatten(-2)], dim=-1)
+
+        gains = self.position_gain.tolist(), self.velocity_gain.tolist()
+        name = hashlib.sha256(f"{type(self).__name__} {gains}".encode()).hexdigest()
+        u, A = rows_in_c(self.model, name, function, rows)(rows).split(
+            [self.num_inputs, self.num_coordinates * self.num_inputs], dim=-1
+        )
+        return u, A.unflatten(-1, (self.num_coordinates, self.num_inputs))
 
     def law(
         self,

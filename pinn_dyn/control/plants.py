@@ -9,6 +9,7 @@ from pydantic import PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Plant
+from pinn_dyn.exports.c_loop import rows_in_c
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Stepped
 
@@ -50,11 +51,16 @@ class SystemPlant(Plant):
 
     def _solve(self, x: Tensor, u: Tensor, duration: float) -> Tensor:
         """Return the states after a time, ``(k, 2N)``, NaN where the solver cannot follow."""
+        size = x.shape[-1]
+
+        def rates(rows: Tensor) -> Tensor:
+            return self._system.velocity_derivative(rows[..., :size], rows[..., size:])
 
         def slope(time: float, flat: np.ndarray) -> np.ndarray:
+            rows = torch.cat([torch.from_numpy(flat).reshape(x.shape), u], dim=-1)
             with torch.no_grad():
-                states = torch.from_numpy(flat).reshape(x.shape)
-                return self._system.velocity_derivative(states, u).numpy().ravel()
+                fast = rows_in_c(self._system, "velocity_derivative", rates, rows)
+                return fast(rows).numpy().ravel()
 
         share = len(x) ** -0.5  # SciPy takes the root mean square over all copies
         solver = scipy.integrate.RK45(

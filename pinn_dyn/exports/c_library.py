@@ -48,9 +48,11 @@ def compiled_rows(
     try:
         code = _code_of_rows(function, x) if known is None else known[0]
         library = load_code(code, ("-O3",) if key is None else QUICK)
-        (m,) = function(x).shape
+        (n,), (m,) = x.shape, function(x).shape
 
         def call(values: Tensor) -> Tensor:
+            if values.shape[-1] != n or values.dtype != torch.float64:
+                return function(values)  # which refuses them
             values = values.contiguous()
             result = values.new_empty(*values.shape[:-1], m)
             pointers = (ctypes.c_void_p(array.data_ptr()) for array in (values, result))

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from weakref import WeakKeyDictionary
 
 import torch
@@ -268,7 +268,7 @@ _ROWS: dict[str, Callable[[Tensor], Tensor]] = {}
 """Functions of rows of this process."""
 _WITHOUT: Counter[str] = Counter()
 """Steps that were taken without a loop."""
-_KEYS: WeakKeyDictionary[CLoop, tuple[list[Any], str]] = WeakKeyDictionary()
+_KEYS: WeakKeyDictionary[nn.Module | CLoop, tuple[list[Any], str]] = WeakKeyDictionary()
 _MOST_LOOPS = 64
 
 
@@ -277,7 +277,7 @@ def _loop_of(
 ) -> Loop | None:
     """Return the loop of a model, or None where it does not pay off yet or is not possible."""
     try:
-        model = _key_of(dynamics, integrator)
+        model = _key_of(cast(nn.Module, dynamics), integrator)
     except Exception:  # from a class that cannot be pickled, or without a file
         log.debug("no loop in C for %s", type(dynamics).__name__, exc_info=True)
         return None
@@ -309,21 +309,22 @@ def _loop_of(
 
 
 def rows_in_c(
-    model: ContinuousPredictor, name: str, function: Callable[[Tensor], Tensor], rows: Tensor
+    model: nn.Module, name: str, function: Callable[[Tensor], Tensor], rows: Tensor
 ) -> Callable[[Tensor], Tensor]:
     """Return a function of a model for rows, in C if that pays off, see :func:`compiled_rows`.
 
     Args:
-        model: a model that :class:`CLoop` integrates.
+        model: the model in float64 on the CPU.
         name: name of the function.
         function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently.
         rows: the next argument of the function, ``(*batch, n)``, float64.
     """
-    if not isinstance(model.integrator, CLoop) or not rows.numel():
+    if not rows.numel():
         return function
     try:
-        key = f"{_key_of(model, model.integrator)}{name}"
+        key = f"{_key_of(model)}{name}"
     except Exception:  # from a class that cannot be pickled, or without a file
+        log.debug("no code in C for %s", type(model).__name__, exc_info=True)
         return function
     if key not in _ROWS:
         is_new, count = key not in _WITHOUT, rows.shape[:-1].numel()
@@ -345,15 +346,15 @@ def versions_of(module: nn.Module) -> list[tuple[int, int]]:
     return versions
 
 
-def _key_of(dynamics: Any, integrator: CLoop) -> str:
-    """Return a digest of all that a path depends on, anew where a tensor has changed."""
-    versions = [id(dynamics), *versions_of(dynamics)]
-    known, key = _KEYS.get(integrator, (None, ""))
+def _key_of(model: nn.Module, integrator: CLoop | None = None) -> str:
+    """Return a digest of all that a path or a function depends on, anew for a changed tensor."""
+    owner, versions = integrator or model, [id(model), *versions_of(model)]
+    known, key = _KEYS.get(owner, (None, ""))
     if known != versions:
         content = BytesIO()
-        _Content(content).dump((dynamics, integrator.inner))
+        _Content(content).dump((model, integrator and integrator.inner))
         key = hashlib.sha256(content.getvalue()).hexdigest()
-        _KEYS[integrator] = versions, key
+        _KEYS[owner] = versions, key
     return key
 
 

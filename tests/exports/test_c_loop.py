@@ -267,3 +267,29 @@ def test_short_paths_and_gradients_do_not_build_a_loop(monkeypatch):
     t = 0.01 * torch.arange(200).double()
     path = copy.predict(x0, t, Signal(t, torch.zeros(200, 3).double()))
     assert path.requires_grad
+
+
+def test_rows_of_a_model_are_compiled_once_for_all_processes(monkeypatch, cached):
+    """From enough rows on, for its own numbers, and without a trace in the next process."""
+    model = make_structured("lnn", **NETWORK).double().eval().requires_grad_(False)
+    rows = torch.rand(4, 9, generator=torch.Generator().manual_seed(2)).double()
+
+    def function(x):
+        return model.forward_dynamics(*x.chunk(3, dim=-1))
+
+    monkeypatch.setattr(c_loop, "STEPS", 2)
+    monkeypatch.setattr(c_loop, "_ROWS", {})
+    assert c_loop.rows_in_c(model, "a", function, rows) is function
+    fast = c_loop.rows_in_c(model, "a", function, rows)
+    assert fast is not function
+    torch.testing.assert_close(fast(rows), function(rows), rtol=1e-10, atol=1e-12)
+    with pytest.raises(ValueError, match="shape|expected"):
+        fast(rows[:, :8])
+    c_loop._ROWS.clear()
+    c_loop._WITHOUT.clear()
+    monkeypatch.setattr(c_library, "trace", None)
+    again = c_loop.rows_in_c(model, "a", function, rows)
+    assert torch.equal(again(rows), fast(rows))
+    with torch.no_grad():
+        next(model.parameters()).add_(0.1)
+    assert c_loop.rows_in_c(model, "a", function, rows) is function
