@@ -32,13 +32,17 @@ class CoupledOscillators(EncodedPredictor):
     potential, so the system with a constant input has one equilibrium, which is globally stable,
     and it is input-to-state stable.
 
-    A step is exact for the linear part, by a matrix exponential. The force, the mean of f at both
-    ends, and the coupling at the start of the step are held::
+    A step takes the forces at the mean of z at both ends, and the coupling by its slope at the
+    start and the bound W^T W of its Hessian::
 
-        x_{k+1} = E x_k + G (f - W^T tanh(W z_k + b)),      x = (z, z')
+        w = (2 I + K/2 + D + W^T W/2)^-1 (2 z' + f - K z - W^T tanh(W z + b))
+        z_{k+1} = z + w,      z'_{k+1} = 2 w - z',      w = (z' + z'_{k+1}) / 2
 
-    All rollouts are bounded at any step: E is the flow of damped oscillators, whose powers vanish,
-    and the held force is bounded by that of the inputs and by the norm of W.
+    with f the mean of its values at both ends. For any parameters and any step, the energy
+    E = V(z) + z'^T z' / 2 changes by at most w^T f - w^T D w: the unforced system never gains
+    energy, since log cosh lies below its expansion with the Hessian bound. All rollouts are
+    bounded: the linear part x_{k+1} = A x_k, with the coupling as a force, decays to zero, and the
+    force is bounded by that of the inputs and by the norm of W.
 
     Source: Stölzle and Della Santina (2024), "Input-to-state stable coupled oscillator networks for
     closed-form model-based control in latent space". The encoder and the output are those of
@@ -87,21 +91,22 @@ class CoupledOscillators(EncodedPredictor):
         return K, D
 
     def flow(self) -> tuple[Tensor, Tensor]:
-        """Return E ``(2n, 2n)`` and G ``(2n, n)`` of a step."""
+        """Return A ``(2n, 2n)`` and B ``(2n, n)`` of a step x_{k+1} = A x_k + B force."""
         K, D = self.matrices()
-        zero, one = torch.zeros_like(K), torch.eye(len(K)).to(K)
-        rows = [[zero, one, zero], [-K, -D, one], [zero, zero, zero]]
-        flow = torch.matrix_exp(torch.cat([torch.cat(row, dim=1) for row in rows]))
-        return flow[: 2 * len(K), : 2 * len(K)], flow[: 2 * len(K), 2 * len(K) :]
+        one = torch.eye(len(K)).to(K)
+        S = torch.linalg.inv(2 * one + K / 2 + D + self.coupling.T @ self.coupling / 2)
+        A = torch.cat([torch.cat([one, 0 * one], dim=1), torch.cat([0 * one, -one], dim=1)])
+        B = torch.cat([S, 2 * S])
+        return A + B @ torch.cat([-K, 2 * one], dim=1), B
 
     def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
         n = len(self.bias)
-        E, G = self.flow()
+        A, B = self.flow()
         start, end = ends.chunk(2, dim=-1)
-        drives = F.linear((self.force(start) + self.force(end)) / 2, G)
+        drives = F.linear((self.force(start) + self.force(end)) / 2, B)
         path = [z]
         for drive in drives:
             coupling = torch.tanh(F.linear(z[..., :n], self.coupling, self.bias)) @ self.coupling
-            z = F.linear(z, E) + drive - F.linear(coupling, G)
+            z = F.linear(z, A) + drive - F.linear(coupling, B)
             path.append(z)
         return path
