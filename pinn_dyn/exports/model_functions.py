@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -80,17 +81,18 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
     elif sizes["memory"]:
         about = f"State after {model.fixed_step:g} s, with u at its start and end."
         begin = "Memory of a rollout. Of q_past and u_past, the latest samples come first."
+        latent: Any = model
         functions = [
-            (model.next_state, "memory u u_next", "memory_next q_next v_next", about),  # type: ignore[operator]
-            (model.start, "q v u q_past u_past", "memory", begin),  # type: ignore[operator]
+            (latent.next_state, "memory u u_next", "memory_next q_next v_next", about),
+            (latent.start, "q v u q_past u_past", "memory", begin),
         ]
     elif hasattr(model, "increment"):
         about = f"State after {model.fixed_step:g} s, with u at its start and end."
         functions = [(next_state, "q v u u_next", "q_next v_next", about)]
     else:
         raise TypeError(
-            f"a {type(model).__name__} has no function of a state to export: export a single member "
-            "of an ensemble, such as run.members[0]"
+            f"a {type(model).__name__} has no function of a state to export: export a single "
+            "member of an ensemble, such as run.members[0]"
         )
     return [exported(*function) for function in functions]
 
