@@ -11,13 +11,17 @@ import torch.nn.functional as F
 from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
+from pinn_dyn.mechanics import double_copy
+from pinn_dyn.mechanics.arrays import jacobians
 from pinn_dyn.models.mlp import Activation
+from pinn_dyn.models.modes import Modes, modes_of
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.subspace_encoder import EncodedPredictor, LinearAndMLP
 
 _SLOWEST, _FASTEST = 0.05, 1.5  # initial eigenfrequencies, rad in a step
 _DAMPING = 0.5  # initial damping ratio
 _SPREAD = 0.5  # initial entries of the factors of K and D, times the root of n
+_NEWTON_STEPS, _HALVINGS = 100, 8
 
 
 class CoupledOscillators(EncodedPredictor):
@@ -90,14 +94,82 @@ class CoupledOscillators(EncodedPredictor):
         K, D = (factor @ factor.T for factor in factors)
         return K, D
 
-    def flow(self) -> tuple[Tensor, Tensor]:
-        """Return A ``(2n, 2n)`` and B ``(2n, n)`` of a step x_{k+1} = A x_k + B force."""
+    def flow(self, ratio: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Return A ``(2n, 2n)`` and B ``(2n, n)`` of a step x_{k+1} = A x_k + B force.
+
+        Args:
+            ratio: length of the step in steps of the training windows.
+        """
         K, D = self.matrices()
         one = torch.eye(len(K)).to(K)
-        S = torch.linalg.inv(2 * one + K / 2 + D + self.coupling.T @ self.coupling / 2)
+        bound = K + self.coupling.T @ self.coupling
+        S = torch.linalg.inv(2 * one + ratio**2 / 2 * bound + ratio * D)
         A = torch.cat([torch.cat([one, 0 * one], dim=1), torch.cat([0 * one, -one], dim=1)])
-        B = torch.cat([S, 2 * S])
-        return A + B @ torch.cat([-K, 2 * one], dim=1), B
+        B = torch.cat([ratio * S, 2 * S])
+        return A + B @ torch.cat([-ratio * K, 2 * one], dim=1), ratio * B
+
+    def coupling_force(self, z: Tensor) -> Tensor:
+        """Return W^T tanh(W z + b), ``(*batch, n)``."""
+        return torch.tanh(F.linear(z, self.coupling, self.bias)) @ self.coupling
+
+    def latent_force(self, u: Tensor) -> Tensor:
+        """Return f(u), ``(*batch, n)``, at u ``(*batch, M)``."""
+        size = self.num_inputs
+        return self.force((u - self._input_mean[:size]) / self._input_std[:size])
+
+    def stiffness_at(self, z: Tensor) -> Tensor:
+        """Return the Hessian of V, ``(*batch, n, n)``."""
+        slope = 1 - torch.tanh(F.linear(z, self.coupling, self.bias)).square()
+        return self.matrices()[0] + self.coupling.T @ (slope.unsqueeze(-1) * self.coupling)
+
+    def equilibrium(self, force: Tensor) -> Tensor:
+        """Return z with K z + W^T tanh(W z + b) = force, ``(*batch, n)``, in float64.
+
+        Newton's method minimizes the convex function V(z) - z^T force. A step is halved until its
+        end has the slope of a descent.
+
+        Raises:
+            RuntimeError: if it does not converge.
+        """
+        K, _ = self.matrices()
+        z = torch.linalg.solve(K + self.coupling.T @ self.coupling, force.unsqueeze(-1))[..., 0]
+        for _ in range(_NEWTON_STEPS):
+            slope = F.linear(z, K) + self.coupling_force(z) - force
+            if bool((slope.norm(dim=-1) <= 1e-9 * (1 + force.norm(dim=-1))).all()):
+                return z
+            step = torch.linalg.solve(self.stiffness_at(z), slope.unsqueeze(-1))[..., 0]
+            length = torch.ones_like(z[..., :1])
+            for _ in range(_HALVINGS):
+                end = z - length * step
+                ahead = F.linear(end, K) + self.coupling_force(end) - force
+                beyond = (ahead * step).sum(-1, keepdim=True) < -0.5 * (slope * step).sum(
+                    -1, keepdim=True
+                )
+                length = torch.where(beyond, length / 2, length)
+            z = z - length * step
+        raise RuntimeError(f"no equilibrium was found within {_NEWTON_STEPS} steps of Newton")
+
+    def modes(self, u: Tensor | None = None) -> Modes:
+        """Return the modes of the model at its equilibrium under a constant input.
+
+        The model is linearized in float64 over a step of the training windows, so that poles are
+        those of its predictions. Poles faster than the step allows stand at half of its rate.
+
+        Args:
+            u: input, ``(M,)``; None takes the mean of the training data.
+        """
+        model = double_copy(self).requires_grad_(False)
+        n, size = len(model.bias), model.num_coordinates
+        u = model._input_mean[: model.num_inputs] if u is None else u.double()
+        z = model.equilibrium(model.latent_force(u))
+        A, B = model.flow()
+        coupling = model.stiffness_at(z) - model.matrices()[0]
+        A[:, :n] -= B @ coupling
+        _, (slope,) = jacobians(model.latent_force, u)
+        x = torch.cat([z, torch.zeros_like(z)])
+        _, (C,) = jacobians(lambda x: model.std[:size] * model.output(x)[..., :size], x)
+        B = B @ slope * model._input_std[: model.num_inputs]
+        return modes_of(A, B, C, step=model.fixed_step, spread=model.std[:size])
 
     def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
         n = len(self.bias)
@@ -106,7 +178,6 @@ class CoupledOscillators(EncodedPredictor):
         drives = F.linear((self.force(start) + self.force(end)) / 2, B)
         path = [z]
         for drive in drives:
-            coupling = torch.tanh(F.linear(z[..., :n], self.coupling, self.bias)) @ self.coupling
-            z = F.linear(z, A) + drive - F.linear(coupling, B)
+            z = F.linear(z, A) + drive - F.linear(self.coupling_force(z[..., :n]), B)
             path.append(z)
         return path

@@ -132,3 +132,42 @@ def test_rollouts_are_bounded_for_any_parameters(spread):
         path = torch.stack(model.latent_path(far, ends)) @ root.T
         growth = path.norm(dim=-1).diff(dim=0).max()
         assert growth <= step * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.1, 1.0])
+def test_modes_are_those_of_a_difference_quotient_of_a_step(spread):
+    """Eigenvalues and vectors by NumPy, at the state where a long rollout comes to rest."""
+    model = oscillators(3, spread)
+    u = torch.tensor([0.3, -0.2]).double()
+    memory = torch.zeros(2 * N + 4).double()
+    for _ in range(3000):
+        memory, *_ = model.next_state(memory, u, u)
+    rest = memory[: 2 * N]
+    assert_near(model.equilibrium(model.latent_force(u)), rest[:N], 1e-7)
+
+    def step(x):
+        later, q, _ = model.next_state(torch.cat([x, torch.zeros(4).double()]), u, u)
+        return later[: 2 * N].numpy(), q.numpy()
+
+    size = 1e-5
+    sides = [[step(rest + s * size * e) for e in torch.eye(2 * N).double()] for s in (1, -1)]
+    A, C = (
+        np.stack([(a[k] - b[k]) / (2 * size) for a, b in zip(*sides, strict=True)], axis=-1)
+        for k in (0, 1)
+    )
+    values, vectors = np.linalg.eig(A)
+    kept = values.imag >= -1e-12
+    poles = np.log(values[kept].astype(complex)) / STEP
+    modes = model.modes(u)
+    assert modes.share[0] == 1
+    assert (modes.share.diff() <= 0).all()
+    for k, pole in enumerate(poles):
+        distance = np.abs(modes.frequency.numpy() - abs(pole) / (2 * np.pi))
+        index = int(distance.argmin())
+        assert distance[index] < 1e-4 * abs(pole)
+        assert abs(modes.damping[index] + pole.real / abs(pole)) < 1e-4
+        # q after the step is C times the vector, times the eigenvalue.
+        shape, expected = modes.shapes[index].numpy(), C @ vectors[:, kept][:, k]
+        cosine = abs(np.vdot(shape, expected)) / np.linalg.norm(shape) / np.linalg.norm(expected)
+        assert cosine > 1 - 1e-6
+    assert len(modes.to_frame(["a [m]", "b [m]"])) == len(poles)
