@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -22,6 +22,23 @@ _SLOWEST, _FASTEST = 0.05, 1.5  # initial eigenfrequencies, rad in a step
 _DAMPING = 0.5  # initial damping ratio
 _SPREAD = 0.5  # initial entries of the factors of K and D, times the root of n
 _NEWTON_STEPS, _HALVINGS = 100, 8
+
+
+class Linearization(NamedTuple):
+    """Equilibrium of oscillators under a constant input, and slopes there.
+
+    Attributes:
+        z, q: latent coordinates ``(*batch, n)`` and configuration ``(*batch, N)`` at rest.
+        stiffness: Hessian of V, ``(*batch, n, n)``.
+        input: df/du, ``(*batch, n, M)``.
+        output: dq/dx for x = (z, z'), ``(*batch, N, 2n)``.
+    """
+
+    z: Tensor
+    q: Tensor
+    stiffness: Tensor
+    input: Tensor
+    output: Tensor
 
 
 class CoupledOscillators(EncodedPredictor):
@@ -135,9 +152,9 @@ class CoupledOscillators(EncodedPredictor):
         z = torch.linalg.solve(K + self.coupling.T @ self.coupling, force.unsqueeze(-1))[..., 0]
         for _ in range(_NEWTON_STEPS):
             slope = F.linear(z, K) + self.coupling_force(z) - force
-            if bool((slope.norm(dim=-1) <= 1e-9 * (1 + force.norm(dim=-1))).all()):
-                return z
             step = torch.linalg.solve(self.stiffness_at(z), slope.unsqueeze(-1))[..., 0]
+            if bool((slope.norm(dim=-1) <= 1e-9 * (1 + force.norm(dim=-1))).all()):
+                return z - step  # with the derivative of z
             length = torch.ones_like(z[..., :1])
             for _ in range(_HALVINGS):
                 end = z - length * step
@@ -149,6 +166,35 @@ class CoupledOscillators(EncodedPredictor):
             z = z - length * step
         raise RuntimeError(f"no equilibrium was found within {_NEWTON_STEPS} steps of Newton")
 
+    def rest(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return z and q of the equilibrium under a constant u, ``(*batch, n or N)``, in float64.
+
+        Raises:
+            RuntimeError: see :meth:`equilibrium`.
+        """
+        z = self.equilibrium(self.latent_force(u))
+        return z, self.observe(torch.cat([z, torch.zeros_like(z)], dim=-1))
+
+    def observe(self, x: Tensor) -> Tensor:
+        """Return q ``(*batch, N)`` of the latent state x = (z, z')."""
+        size = self.num_coordinates
+        return self.mean[:size] + self.std[:size] * self.output(x)[..., :size]
+
+    def linearize(self, u: Tensor) -> Linearization:
+        """Return the slopes of the model at its equilibrium under u ``(*batch, M)``, in float64."""
+        z, q = self.rest(u)
+        x = torch.cat([z, torch.zeros_like(z)], dim=-1)
+        _, (slope,) = jacobians(self.latent_force, u)
+        _, (output,) = jacobians(self.observe, x)
+        return Linearization(z, q, self.stiffness_at(z), slope, output)
+
+    def transition(self, at: Linearization, ratio: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Return A ``(2n, 2n)`` and B ``(2n, M)`` of a linearized step, see :meth:`flow`."""
+        n = len(self.bias)
+        A, B = self.flow(ratio)
+        A = A - F.pad(B @ (at.stiffness - self.matrices()[0]), (0, n))
+        return A, B @ at.input
+
     def modes(self, u: Tensor | None = None) -> Modes:
         """Return the modes of the model at its equilibrium under a constant input.
 
@@ -158,18 +204,12 @@ class CoupledOscillators(EncodedPredictor):
         Args:
             u: input, ``(M,)``; None takes the mean of the training data.
         """
-        model = double_copy(self).requires_grad_(False)
-        n, size = len(model.bias), model.num_coordinates
+        model, size = double_copy(self).requires_grad_(False), self.num_coordinates
         u = model._input_mean[: model.num_inputs] if u is None else u.double()
-        z = model.equilibrium(model.latent_force(u))
-        A, B = model.flow()
-        coupling = model.stiffness_at(z) - model.matrices()[0]
-        A[:, :n] -= B @ coupling
-        _, (slope,) = jacobians(model.latent_force, u)
-        x = torch.cat([z, torch.zeros_like(z)])
-        _, (C,) = jacobians(lambda x: model.std[:size] * model.output(x)[..., :size], x)
-        B = B @ slope * model._input_std[: model.num_inputs]
-        return modes_of(A, B, C, step=model.fixed_step, spread=model.std[:size])
+        at = model.linearize(u)
+        A, B = model.transition(at)
+        B = B * model._input_std[: model.num_inputs]
+        return modes_of(A, B, at.output, step=model.fixed_step, spread=model.std[:size])
 
     def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
         n = len(self.bias)
