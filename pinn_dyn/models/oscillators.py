@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, NamedTuple
 
 import torch
@@ -12,15 +12,15 @@ from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics import double_copy
-from pinn_dyn.mechanics.arrays import jacobians
 from pinn_dyn.models.mlp import Activation
 from pinn_dyn.models.modes import Modes, modes_of
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.subspace_encoder import EncodedPredictor, LinearAndMLP
 
-_SLOWEST, _FASTEST = 0.05, 1.5  # initial eigenfrequencies, rad in a step
+_SLOWEST, _FASTEST = 0.4, 1.2  # initial eigenfrequencies, rad in a step
 _DAMPING = 0.5  # initial damping ratio
-_SPREAD = 0.5  # initial entries of the factors of K and D, times the root of n
+_SPREAD = 0.3  # initial entries of the factors of K and D, times the root of n
+_COUPLING = 0.1  # initial entries of W, times the root of n
 _NEWTON_STEPS, _HALVINGS = 100, 8
 
 
@@ -39,6 +39,12 @@ class Linearization(NamedTuple):
     stiffness: Tensor
     input: Tensor
     output: Tensor
+
+
+def _slopes(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Return dy/dx ``(*batch, n, m)`` of y = f(x) ``(*batch, n)``, row by row."""
+    rows = torch.func.vmap(torch.func.jacrev(function))(x.reshape(-1, x.shape[-1]))
+    return rows.reshape(*x.shape[:-1], *rows.shape[1:])
 
 
 class CoupledOscillators(EncodedPredictor):
@@ -99,7 +105,7 @@ class CoupledOscillators(EncodedPredictor):
         self.stiffness = nn.Parameter(torch.diag(frequency) + mixed[0].tril(-1))
         damping = (frequency + math.log(2 * _DAMPING)) / 2
         self.damping = nn.Parameter(torch.diag(damping) + mixed[1].tril(-1))
-        self.coupling = nn.Parameter(torch.randn(n, n) / n**0.5)
+        self.coupling = nn.Parameter(_COUPLING * torch.randn(n, n) / n**0.5)
         self.bias = nn.Parameter(torch.randn(n))
 
     def matrices(self) -> tuple[Tensor, Tensor]:
@@ -139,7 +145,7 @@ class CoupledOscillators(EncodedPredictor):
         slope = 1 - torch.tanh(F.linear(z, self.coupling, self.bias)).square()
         return self.matrices()[0] + self.coupling.T @ (slope.unsqueeze(-1) * self.coupling)
 
-    def equilibrium(self, force: Tensor) -> Tensor:
+    def equilibrium(self, force: Tensor, start: Tensor | None = None) -> Tensor:
         """Return z with K z + W^T tanh(W z + b) = force, ``(*batch, n)``, in float64.
 
         Newton's method minimizes the convex function V(z) - z^T force. A step is halved until its
@@ -149,11 +155,13 @@ class CoupledOscillators(EncodedPredictor):
             RuntimeError: if it does not converge.
         """
         K, _ = self.matrices()
-        z = torch.linalg.solve(K + self.coupling.T @ self.coupling, force.unsqueeze(-1))[..., 0]
+        bound = K + self.coupling.T @ self.coupling
+        z = torch.linalg.solve(bound, force.unsqueeze(-1))[..., 0] if start is None else start
         for _ in range(_NEWTON_STEPS):
             slope = F.linear(z, K) + self.coupling_force(z) - force
             step = torch.linalg.solve(self.stiffness_at(z), slope.unsqueeze(-1))[..., 0]
-            if bool((slope.norm(dim=-1) <= 1e-9 * (1 + force.norm(dim=-1))).all()):
+            # NaN is returned.
+            if not bool((slope.norm(dim=-1) > 1e-9 * (1 + force.norm(dim=-1))).any()):
                 return z - step  # with the derivative of z
             length = torch.ones_like(z[..., :1])
             for _ in range(_HALVINGS):
@@ -166,13 +174,17 @@ class CoupledOscillators(EncodedPredictor):
             z = z - length * step
         raise RuntimeError(f"no equilibrium was found within {_NEWTON_STEPS} steps of Newton")
 
-    def rest(self, u: Tensor) -> tuple[Tensor, Tensor]:
+    def rest(self, u: Tensor, start: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return z and q of the equilibrium under a constant u, ``(*batch, n or N)``, in float64.
+
+        Args:
+            u: input, ``(*batch, M)``.
+            start: z to start from, such as that of a similar input.
 
         Raises:
             RuntimeError: see :meth:`equilibrium`.
         """
-        z = self.equilibrium(self.latent_force(u))
+        z = self.equilibrium(self.latent_force(u), start)
         return z, self.observe(torch.cat([z, torch.zeros_like(z)], dim=-1))
 
     def observe(self, x: Tensor) -> Tensor:
@@ -180,13 +192,12 @@ class CoupledOscillators(EncodedPredictor):
         size = self.num_coordinates
         return self.mean[:size] + self.std[:size] * self.output(x)[..., :size]
 
-    def linearize(self, u: Tensor) -> Linearization:
-        """Return the slopes of the model at its equilibrium under u ``(*batch, M)``, in float64."""
-        z, q = self.rest(u)
+    def linearize(self, u: Tensor, start: Tensor | None = None) -> Linearization:
+        """Return the slopes of the model at its equilibrium, see :meth:`rest`."""
+        z, q = self.rest(u, start)
         x = torch.cat([z, torch.zeros_like(z)], dim=-1)
-        _, (slope,) = jacobians(self.latent_force, u)
-        _, (output,) = jacobians(self.observe, x)
-        return Linearization(z, q, self.stiffness_at(z), slope, output)
+        slopes = _slopes(self.latent_force, u), _slopes(self.observe, x)
+        return Linearization(z, q, self.stiffness_at(z), *slopes)
 
     def transition(self, at: Linearization, ratio: float = 1.0) -> tuple[Tensor, Tensor]:
         """Return A ``(2n, 2n)`` and B ``(2n, M)`` of a linearized step, see :meth:`flow`."""
