@@ -70,7 +70,7 @@ class LatentLaw(Controller):
     def __init__(
         self,
         model: CoupledOscillators,
-        position_gain: NonNegativeFloat = 1.0,
+        position_gain: NonNegativeFloat = 0.3,
         velocity_gain: NonNegativeFloat = 0.0,
         integral_gain: PositiveFloat = 10.0,
         *,

@@ -28,6 +28,9 @@ _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a
 _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
 _OF_MOTORS = {"rad", "m", "Pa"}  # units of motor angles, lengths of tendons, and pressures
+# Settings that were the best on a real trunk, docs/what_we_tried.md.
+_LATENT = ("data.steps=40", "loss.velocity_weight=0.1", "optimizer.lr=0.012")
+_LATENT += ("optimizer.weight_decay=0.05", "trainer.steps=1200", "trainer.validations=8")
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
 # Column of the table of coordinates, its upper limit, and the text beyond it.
 _LIMITS = (
@@ -119,11 +122,11 @@ def _follows_targets(
 
 
 def _latent_windows(training: list[logs.Recording], step: float) -> list[str]:
-    """Return options for windows of 40 steps, with ten steps in a period of the fastest input."""
+    """Return options of oscillators, with ten steps in a period of the fastest input."""
     inputs = [replace(item, q=item.u) for item in training]
     fastest = numbers.bandwidth(inputs, step, np.zeros(training[0].u.shape[1]))
     stride = max(round(0.1 / max(fastest, 0.1) / step), 1) * step
-    return [f"data.stride={1e3 * stride:.6g} ms", "data.steps=40", "loss.velocity_weight=0.1"]
+    return [f"data.stride={1e3 * stride:.6g} ms", *_LATENT]
 
 
 def _inputs_measured(

@@ -95,6 +95,31 @@ def test_the_steady_state_error_vanishes_with_a_wrong_model(model, periods, shar
     assert (wrong - model.rest(law._u_d)[1]).norm() > 0.01 * steps.min()  # the model was wrong
 
 
+def test_the_velocity_of_the_reference_reduces_the_lag(model):
+    """A slow ramp: damping against z_d' does not hold the robot back."""
+    start, end = model.rest(model.mean[-2:] + torch.tensor([[-0.3], [0.3]]) * model.std[-2:])[1]
+    seconds = 150 * STEP
+
+    class Ramp(Reference):
+        num_coordinates = 2
+
+        def __init__(self, known):
+            self.known = known
+
+        def __call__(self, t):
+            v = (end - start) / seconds
+            return Motion(start + v * t, self.known * v, 0 * v)
+
+    lags = []
+    for known in (1.0, 0.0):
+        law = LatentLaw(model, 0.5, 2 * STEP, 0.2 / STEP)
+        q0 = start[None]
+        setting = dict(duration=seconds, rate=1 / STEP)
+        record = close_loop(Oscillators(model), law, Ramp(known), q0, 0 * q0, **setting)
+        lags.append((record.q - record.reference.q)[0, 100:].norm(dim=-1).mean())
+    assert lags[0] < 0.8 * lags[1]
+
+
 def test_the_error_of_the_observer_decays_at_any_rate(model):
     law = LatentLaw(model, 1.0, 0.0, 0.2 / STEP)
     for period in (0.05 * STEP, STEP, 20 * STEP):

@@ -201,7 +201,7 @@ def test_inputs_in_the_unit_of_the_coordinates_are_no_targets_if_the_robot_does_
     stride, *more = result.options
     # Forces with knots every 0.2 s, so up to 2.5 Hz; kinks reach further.
     assert 10 <= float(stride.removeprefix("data.stride=").removesuffix(" ms")) <= 40
-    assert more == ["data.steps=40", "loss.velocity_weight=0.1"]
+    assert more[:2] == ["data.steps=40", "loss.velocity_weight=0.1"]
     assert "model=oscillators 'data.stride=" in str(result)
 
 

@@ -299,8 +299,8 @@ def _modes(item: Evaluation, figures: Mapping[str, Figure]) -> Iterator[Markup]:
             "Eigenfrequencies, damping ratios and shapes of the model, linearized at its "
             "equilibrium under the mean input of the training data. The modes are sorted by their "
             "share: the standard deviation of q due to a mode alone, in relation to the strongest "
-            "mode, if the inputs are white noise. Modes with small shares help to fit the data and "
-            "have little meaning. The files modes_<run>.csv hold all modes."
+            "mode, if the inputs are white noise. Only what recurs with other seeds belongs to the "
+            "robot. The files modes_<run>.csv hold all modes."
         )
     for run, modes in item.modes.items():
         title = f"{run}: modes at the mean input"
