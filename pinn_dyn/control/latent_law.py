@@ -32,7 +32,8 @@ class LatentLaw(Controller):
     q(u) and z(u) are the equilibrium of the model under a constant input u. F = df/du at u_d and
     the Hessian H of the potential belong to z_d. Inputs are divided by their standard deviations S
     in the data. The feedback is collocated: F^T z' does the work of the inputs, and C^+ is positive
-    semi-definite. So the exact latent state with the continuous law loses energy at u_d = const.
+    semi-definite. z and z' are the means of the coming period, which follow from u, so that the
+    linearized model loses energy at u_d = const for all gains and periods.
 
     The latent state and a disturbance d of the output follow from the measured q::
 
@@ -203,15 +204,23 @@ class LatentLaw(Controller):
         return torch.linalg.pinv(J, rtol=_RANK)
 
     def _feedback(self, at: Linearization, x: Tensor, v_ref: Tensor) -> Tensor:
+        """Return (u - u_d) / S from the mean state of the coming period, which it changes."""
         F = at.input * self._u_std
         compliant = torch.linalg.solve(at.stiffness, F)
         psi = torch.linalg.pinv(F.mT @ compliant, rtol=_RANK, hermitian=True) @ F.mT
-        z, rate = x.chunk(2, dim=-1)
-        rate_d = matvec(compliant @ self._inverse_gain(at), v_ref / self._q_std)
-        seconds = self.model.fixed_step
-        feedback = self.position_gain * (at.z - z)
-        feedback = feedback + self.velocity_gain * (rate_d - rate / seconds)
-        return matvec(psi, feedback)
+        # Velocities and the velocity gain are those per step of the model.
+        step = self.model.fixed_step
+        rate_d = step * matvec(compliant @ self._inverse_gain(at), v_ref / self._q_std)
+        (z, rate), ratio, effect = x.chunk(2, dim=-1), self._period / step, torch.zeros_like(F)
+        if ratio:
+            later = self._moved(x, self._flow, self._u_d)
+            rate = (later[..., : z.shape[-1]] - z) / ratio
+            effect = self._flow[1][: z.shape[-1]] @ F / ratio
+        position, velocity = self.position_gain, self.velocity_gain / step
+        wanted = position * (at.z - z - ratio / 2 * rate) + velocity * (rate_d - rate)
+        change = (ratio / 2 * position + velocity) * psi @ effect
+        one = torch.eye(self.num_inputs).to(change)
+        return torch.linalg.solve(one + change, matvec(psi, wanted).unsqueeze(-1))[..., 0]
 
     def diagnostics(self) -> dict[str, Tensor]:
         """Return ``static_residual``: |q(u_d) - q_ref + d| in standard deviations of q."""

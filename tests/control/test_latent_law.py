@@ -95,6 +95,32 @@ def test_the_steady_state_error_vanishes_with_a_wrong_model(model, periods, shar
     assert (wrong - model.rest(law._u_d)[1]).norm() > 0.01 * steps.min()  # the model was wrong
 
 
+@pytest.mark.parametrize("gain", [10.0, 1000.0])
+@pytest.mark.parametrize("share", [0.25, 2.0])
+def test_no_gain_and_no_rate_is_too_large_for_the_model(model, gain, share):
+    """The energy of the model, linear and with the spring of the law, never rises."""
+    law = LatentLaw(model, gain, gain * STEP, 0.2 / STEP)
+    u, n, ratio = model.mean[-2:], len(model.bias), share
+    at = model.linearize(u)
+    A, B = model.transition(at, ratio)
+    F = at.input * model.std[-2:]
+    compliant = torch.linalg.solve(at.stiffness, F)
+    spring = gain * F @ torch.linalg.solve(F.T @ compliant, F.T)
+    law._u_d, law._period, law._flow = u[None], share * STEP, model.flow(ratio)
+    x = 1e-5 * torch.randn(1, 2 * n, generator=torch.manual_seed(0)).double()
+    rest = torch.cat([at.z, torch.zeros_like(at.z)])
+    energies = []
+    for _ in range(50):
+        z, v = x[0].chunk(2)
+        energies.append(z @ (at.stiffness + spring) @ z + v @ v)
+        feedback = law._feedback(model.linearize(u[None]), rest + x, torch.zeros(1, 2).double())
+        x = x @ A.T + (feedback * model.std[-2:]) @ B.T
+    energies = torch.stack(energies)
+    # Up to what the linearization of the step leaves.
+    assert (energies.diff() <= 1e-3 * energies[:-1]).all()
+    assert energies[-1] < 0.2 * energies[0]
+
+
 def test_the_velocity_of_the_reference_reduces_the_lag(model):
     """A slow ramp: damping against z_d' does not hold the robot back."""
     start, end = model.rest(model.mean[-2:] + torch.tensor([[-0.3], [0.3]]) * model.std[-2:])[1]
