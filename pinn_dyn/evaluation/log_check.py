@@ -29,8 +29,10 @@ _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
 _OF_MOTORS = {"rad", "m", "Pa"}  # units of motor angles, lengths of tendons, and pressures
 # Settings that were the best on a real trunk, docs/what_we_tried.md.
-_LATENT = ("data.steps=40", "loss.velocity_weight=0.1", "optimizer.lr=0.012")
-_LATENT += ("optimizer.weight_decay=0.05", "trainer.steps=1200", "trainer.validations=8")
+_LATENT = [
+    *("data.steps=40", "loss.velocity_weight=0.1", "optimizer.lr=0.012"),
+    *("optimizer.weight_decay=0.05", "trainer.steps=1200", "trainer.validations=8"),
+]
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
 # Column of the table of coordinates, its upper limit, and the text beyond it.
 _LIMITS = (
