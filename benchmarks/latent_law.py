@@ -3,8 +3,8 @@
     python -m benchmarks.latent_law RUN
 
 RUN is a run of model=oscillators on dataset=soft_arm_tendon. Prints the largest error from 1 s to
-1.5 s after the step, in percent of the step: the mean and the worst of 20 set points, and the number
-of runs that were stopped. The gains are factors of those of experiment=soft_arm_tendon/latent.
+1.5 s after the step, in percent of the step: the mean and the worst of 20 set points, and the
+number of stopped runs. The gains are factors of those of experiment=soft_arm_tendon/latent.
 """
 
 from __future__ import annotations
