@@ -33,6 +33,7 @@ _LATENT = [
     *("data.steps=40", "loss.velocity_weight=0.1", "optimizer.lr=0.012"),
     *("optimizer.weight_decay=0.05", "trainer.steps=1200", "trainer.validations=8"),
 ]
+_STEPS = [x * 10.0**k for k in (-3, -2, -1) for x in (1, 2, 5)]  # s
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
 # Column of the table of coordinates, its upper limit, and the text beyond it.
 _LIMITS = (
@@ -124,10 +125,12 @@ def _follows_targets(
 
 
 def _latent_windows(training: list[logs.Recording], step: float) -> list[str]:
-    """Return options of oscillators, with ten steps in a period of the fastest input."""
+    """Return options of oscillators, with about ten steps in a period of the fastest input."""
     inputs = [replace(item, q=item.u) for item in training]
     fastest = numbers.bandwidth(inputs, step, np.zeros(training[0].u.shape[1]))
-    stride = max(round(0.1 / max(fastest, 0.1) / step), 1) * step
+    longest = 0.1 / max(fastest, 0.1)
+    round_numbers = [x for x in _STEPS if x >= 0.99 * longest and abs(x / step % 1 - 0.5) > 0.49]
+    stride = round_numbers[0] if round_numbers else max(round(longest / step), 1) * step
     return [f"data.stride={1e3 * stride:.6g} ms", *_LATENT]
 
 
