@@ -111,7 +111,7 @@ def comparison(entries: dict[str, Entry], folder: Path) -> pd.DataFrame:
         tables = [pd.read_csv(path) for path in summaries(name, entry, folder) if path.is_file()]
         new = pd.concat(tables or [pd.DataFrame(columns=["model", "seed", metric])])
         new = new.rename(columns={"controller": "model"}).dropna(subset=set(new) & {"seed"})
-        if old["model"].nunique() == 1:
+        if "control" not in entry and old["model"].nunique() == 1:  # laws keep their names
             new = new.assign(model=old["model"].iloc[0])
         means = (table.groupby("model")[metric].mean() for table in (new, old))
         errors[name] = pd.concat(means, axis=1, keys=["new", "recorded"])

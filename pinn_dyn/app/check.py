@@ -43,6 +43,9 @@ def check(cfg: DictConfig) -> None:
         options = [option for option in report.options if "friction" not in option]  # the default
         options += _gains(report) if "model/input=servo" not in options else []
         print(f"a training of its constants: {_training(options, True)}")
+    elif report.options and report.model == "oscillators":
+        print(f"a training: {_training(report.options, model=report.model)}")
+        print("the modes, a control law and C code follow: docs/soft_robots.md")
     elif report.options:
         names = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
         effects = " and ".join(names[option] for option in report.options if option in names)
@@ -67,8 +70,8 @@ def _gains(report: LogCheck) -> list[str]:
     return [f"model.drive_gain=[{values}]", "model.gain_spread=0.5"]
 
 
-def _training(options: list[str], with_structure: bool = False) -> str:
-    """Return the command that trains a Lagrangian network on this data set, for a shell.
+def _training(options: list[str], with_structure: bool = False, model: str = "lnn") -> str:
+    """Return the command that trains a model on this data set, for a shell.
 
     The command identifies the structure that the check was called with, if ``with_structure``.
     """
@@ -80,5 +83,5 @@ def _training(options: list[str], with_structure: bool = False) -> str:
     parts.insert(parts[:1] == ["python"], str(name))
     if not any(x.startswith("dataset=") for x in parts):
         parts.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
-    model = ["experiment=known"] if with_structure else ["model=lnn", "data=multi_step"]
-    return shlex.join([*parts, *model, *options])
+    chosen = ["experiment=known"] if with_structure else [f"model={model}", "data=multi_step"]
+    return shlex.join([*parts, *chosen, *options])

@@ -21,6 +21,8 @@ from pinn_dyn.control import (
     DataRegion,
     DisturbanceObserver,
     Guarded,
+    LatentLaw,
+    MotorPID,
     Reference,
     export_law,
     term_conditions,
@@ -30,6 +32,7 @@ from pinn_dyn.data import DataSource, SimulationError
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
+from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.run.build import ConfigError, build_part
 from pinn_dyn.run.export import ranges_of
 from pinn_dyn.run.provenance import write_provenance
@@ -128,10 +131,15 @@ def _require_learned_law(config: dict[str, Any], source: DataSource) -> None:
 
 
 def _without_robot(
-    learned: MechanicalSystem, run: Run, config: dict[str, Any], folder: Path
+    learned: MechanicalSystem | CoupledOscillators, run: Run, config: dict[str, Any], folder: Path
 ) -> float:
     """Export the law on a model of measured data, and write how well it is conditioned."""
     source = run.source
+    if isinstance(learned, CoupledOscillators):
+        raise ConfigError(
+            f"{source.name} has no simulated robot, and a law on oscillators has no file: export "
+            "the model with run.export, or use pinn_dyn.control.LatentLaw in Python"
+        )
     if config["export"]:
         _export(_law(config["exported_law"], run, config, learned, learned), run, config)
     q = torch.cat([_thinned(item.q) for item in source.load().train])
@@ -151,15 +159,23 @@ def _law(
     name: str,
     run: Run,
     config: dict[str, Any],
-    learned: MechanicalSystem,
+    learned: MechanicalSystem | CoupledOscillators,
     truth: MechanicalSystem,
 ) -> Controller:
     """Build a law with its observer, guard and compensation of the delay, for loop and export."""
     law = build_law(config, name, learned, truth)
+    if isinstance(law, LatentLaw):
+        if config["guard"].get("threshold") is not None:
+            raise ConfigError("guard: a law on oscillators has no guard: leave the key out")
+        law.dead_time = float(np.max(run.input_delay, initial=0.0))
+        return law
+    if isinstance(law, MotorPID):
+        return law
     guarded = {"learned", config["exported_law"]} if config["export"] else {"learned"}
     if config["guard"].get("threshold") is not None and name in guarded:
         law = _guarded(law, config, run.source)
     model = learned if config["controllers"][name]["terms"] == "learned" else truth
+    assert isinstance(model, MechanicalSystem)
     actuator = build_part("actuator", config["actuator"])
     return compensated(law, model, run.input_delay, config["rate"], actuator)
 
@@ -184,16 +200,21 @@ def _thinned(values: Tensor) -> Tensor:
     return values[:: max(1, len(values) // _REGION_SAMPLES)]
 
 
-def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem:
+def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem | CoupledOscillators:
     model = run.model
     if isinstance(model, Ensemble):
         model = model.member(config["member"])
     elif config["member"]:
         raise ConfigError(f"member is {config['member']}, but {run.folder} holds a single model")
+    if isinstance(model, CoupledOscillators):
+        if config["stability"] is not None:
+            raise ConfigError("stability: oscillators have no terms M, G and A: leave the key out")
+        return double_copy(model).requires_grad_(False)
     if not isinstance(model, MechanicalSystem):
         raise ConfigError(
             f"{run.folder} holds a black box ({run.config['model_name']}), which has no terms "
-            "M, G and A for a control law: give a run of model=lnn or model=hnn"
+            "M, G and A for a control law: give a run of model=lnn or model=hnn, or of "
+            "model=oscillators for controllers=latent"
         )
     if not model.num_inputs:
         raise ConfigError(f"{run.folder}: the model has no inputs, so no control law can move it")

@@ -34,6 +34,7 @@ from pinn_dyn.evaluation.report.control_page import control_report, shown_column
 from pinn_dyn.evaluation.report.page import Origin
 from pinn_dyn.evaluation.tables import to_text, with_unit, write_table
 from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.systems import Drawable, HasTip
 
 _ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
@@ -42,7 +43,7 @@ _ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
 def write_results(
     result: ControlResult,
     source: DataSource,
-    learned: MechanicalSystem,
+    learned: MechanicalSystem | CoupledOscillators,
     robot: MechanicalSystem,
     reference: Reference,
     config: dict[str, Any],
@@ -55,6 +56,7 @@ def write_results(
     result.save(folder)
     figures, stability = _figures(records, source, robot, reference, config), None
     if config["stability"] is not None:
+        assert isinstance(learned, MechanicalSystem)
         stability, bounds = _stability(learned, robot, records["learned"], config, folder)
         title = "Steady-state error of the learned regulator and its predicted bound"
         if bounds[0].isfinite().any():

@@ -7,6 +7,7 @@ from pinn_dyn.control.dead_time import DelayCompensation
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.export import export_law
 from pinn_dyn.control.helix import Helix
+from pinn_dyn.control.latent_law import LatentLaw
 from pinn_dyn.control.laws import (
     ComputedTorque,
     ModelBasedLaw,
@@ -14,6 +15,7 @@ from pinn_dyn.control.laws import (
     Regulation,
     Tracking,
 )
+from pinn_dyn.control.motor_pid import MotorPID
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.control.predictive import PredictiveControl
@@ -34,8 +36,10 @@ __all__ = [
     "DisturbanceObserver",
     "Guarded",
     "Helix",
+    "LatentLaw",
     "ModelBasedLaw",
     "Motion",
+    "MotorPID",
     "Plant",
     "PointToPoint",
     "PredictiveControl",

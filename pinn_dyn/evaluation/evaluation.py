@@ -26,6 +26,7 @@ from pinn_dyn.evaluation.tables import (
 )
 from pinn_dyn.evaluation.torque import part_shares, residual_share, torque_error
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Sum, Trajectory, samples_of, stack_until
+from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -121,6 +122,7 @@ def evaluate_models(
         rows.append(row)
     summary = pd.DataFrame(rows).astype({"seed": "Int64"})
     terms = {entry.run: compare_with_source(entry.model, source) for entry in entries}
+    modes = {x.run: x.model.modes() for x in entries if isinstance(x.model, CoupledOscillators)}
     return Evaluation(
         source=source,
         split=split,
@@ -133,6 +135,7 @@ def evaluate_models(
         predictions=predictions,
         intervals=intervals,
         terms={run: item for run, item in terms.items() if item is not None},
+        modes=modes,
     )
 
 

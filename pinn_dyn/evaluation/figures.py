@@ -28,9 +28,12 @@ from pinn_dyn.evaluation.plots import (
 from pinn_dyn.evaluation.prediction import Prediction
 from pinn_dyn.evaluation.tables import number, with_unit
 from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.models.modes import Modes
 
 ERROR = "‖q̂ − q‖₂"
 _TERMS = {"M": "$M(q)$", "M_inverse": "$M^{-1}(q)$", "D": "$D(q)$", "G": "$G(q)$", "A": "$A(q)$"}
+_SHAPES = 6  # number of modes whose shapes are drawn
+_SMALLEST_SHARE = 0.02  # of a mode that is drawn
 
 
 def trajectory_figure(
@@ -147,6 +150,40 @@ def _annotate(ax: Axes, matrix: Tensor, digits: int) -> None:
             text = f"{value:.0f}" if 100 <= abs(value) < 1e5 else f"{value:.{digits}g}"
             text = text if abs(value) > smallest else "0"
             ax.text(j, i, text, ha="center", va="center", fontsize="x-small")
+
+
+def modes_figure(modes: Modes, *, title: str, labels: Sequence[str]) -> Figure:
+    """Draw eigenfrequencies and damping ratios, and the shapes of the strongest modes.
+
+    The area of a dot grows with the share of its mode. Numbers are those of the table of modes. A
+    shape is relative to the spread of each coordinate in the training data.
+    """
+    figure = Figure(figsize=(10.5, 4.8), layout="constrained")
+    plane, shapes = figure.subplots(1, 2, width_ratios=[1.3, 1])
+    shown = modes.share > _SMALLEST_SHARE
+    frequency, damping, share = (
+        x[shown].numpy() for x in (modes.frequency, modes.damping, modes.share)
+    )
+    color = model_style(0)["color"]
+    plane.scatter(frequency, damping, s=20 + 300 * share, color=color, alpha=0.45)
+    strongest = range(min(_SHAPES, len(frequency)))
+    for k in strongest:
+        plane.annotate(str(k + 1), (frequency[k], damping[k]), ha="center", va="center")
+    plane.set(xscale="log", xlabel="eigenfrequency [Hz]", ylabel="damping ratio", ylim=(0, 1.08))
+    for formatted in (plane.xaxis.set_major_formatter, plane.xaxis.set_minor_formatter):
+        formatted("{x:g}")
+    plane.grid(True, alpha=0.3)
+    values = modes.relative_shapes[: len(strongest)]
+    shapes.imshow(values, cmap="RdBu_r", vmin=-1.6, vmax=1.6, aspect="auto")
+    for i, row in enumerate(values.tolist()):
+        for j, value in enumerate(row):
+            shapes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize="small")
+    names = [f"{k + 1}: {frequency[k]:.3g} Hz, ζ {damping[k]:.2f}" for k in strongest]
+    shapes.set_xticks(range(len(labels)), labels)
+    shapes.set_yticks(strongest, names)
+    shapes.set_title("shapes, in standard deviations of q", fontsize="medium")
+    figure.suptitle(title)
+    return figure
 
 
 def sweep_figure(runs: pd.DataFrame, *, x: str, lines: Sequence[str], y: str) -> Figure:

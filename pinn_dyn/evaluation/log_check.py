@@ -27,6 +27,13 @@ _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a train
 _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
 _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
+_OF_MOTORS = {"rad", "m", "Pa"}  # units of motor angles, lengths of tendons, and pressures
+# Settings that were the best on a real trunk, docs/what_we_tried.md.
+_LATENT = [
+    *("data.steps=40", "loss.velocity_weight=0.1", "optimizer.lr=0.012"),
+    *("optimizer.weight_decay=0.05", "trainer.steps=1200", "trainer.validations=8"),
+]
+_STEPS = [x * 10.0**k for k in (-3, -2, -1) for x in (1, 2, 5)]  # s
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
 # Column of the table of coordinates, its upper limit, and the text beyond it.
 _LIMITS = (
@@ -89,6 +96,9 @@ def check(
     fast = (coordinates["fastest [/s]"] * step > _TURNED)[angles].any()
     options = ["model/input=servo", "model/integrator=rosenbrock"] * servo
     options += ["model/friction=coulomb"] * dry
+    motors = structure is None and not servo and set(source.u.units[:inputs]) <= _OF_MOTORS
+    if motors:
+        options = _latent_windows(training, step)
     return LogCheck(
         source=source,
         measurements=measurements,
@@ -99,6 +109,7 @@ def check(
         steps=_filter(source, training, step, coordinates, highest) if filtered else [],
         delay=_delay(source, clear),
         options=[] if fast else options,
+        model="oscillators" if motors else "lnn",
         rigid=excitation,
         motion=motion,
         equations=equations,
@@ -111,6 +122,16 @@ def _follows_targets(
     """Tell whether the inputs are targets that the coordinates follow."""
     same_units = source.u.units[: len(source.q.units)] == source.q.units
     return same_units and numbers.target_distance(training, step, longest) < _TARGET
+
+
+def _latent_windows(training: list[logs.Recording], step: float) -> list[str]:
+    """Return options of oscillators, with about ten steps in a period of the fastest input."""
+    inputs = [replace(item, q=item.u) for item in training]
+    fastest = numbers.bandwidth(inputs, step, np.zeros(training[0].u.shape[1]))
+    longest = 0.1 / max(fastest, 0.1)
+    round_numbers = [x for x in _STEPS if x >= 0.99 * longest and abs(x / step % 1 - 0.5) > 0.49]
+    stride = round_numbers[0] if round_numbers else max(round(longest / step), 1) * step
+    return [f"data.stride={1e3 * stride:.6g} ms", *_LATENT]
 
 
 def _inputs_measured(

@@ -163,7 +163,7 @@ def drawn_states(
     """Return 200 values of inputs by name, ``(200, size)``, or ``(200,)`` for the size None.
 
     They are uniform within the range of an input, or [-1, 1], with a fixed seed. ``q_ref`` and
-    ``u_next`` have the ranges of ``q`` and ``u``.
+    ``u_next`` have the ranges of ``q`` and ``u``, which ``q_past`` repeats.
     """
     generator = torch.Generator().manual_seed(0)
     unit = torch.ones((), dtype=torch.float64)
@@ -171,6 +171,9 @@ def drawn_states(
     for name, size in sizes.items():
         low, high = (ranges or {}).get(name.partition("_")[0], (-unit, unit))
         shape = (STATES,) if size is None else (STATES, size)
+        if low.ndim and size is not None:
+            times = size // max(len(low), 1)
+            low, high = low.repeat(times), high.repeat(times)
         share = torch.rand(shape, generator=generator, dtype=torch.float64)
         values[name] = low + (high - low) * share
     return values

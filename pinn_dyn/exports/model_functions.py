@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,9 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
       ``terms(q)``, which are M, D, G and A, with matrices row by row;
     - black boxes of the acceleration: ``forward_dynamics``;
     - both: ``step(q, v, u, h)``, q and v after h seconds with u held, by the model's integrator;
-    - black boxes of the next state: ``next_state(q, v, u, u_next)`` after the model's step.
+    - black boxes of the next state: ``next_state(q, v, u, u_next)`` after the model's step;
+    - models with a latent state: ``start(q, v, u, q_past, u_past)``, the memory at the start of a
+      rollout, and ``next_state(memory, u, u_next)``, memory, q and v after the model's step.
 
     Args:
         model: the model.
@@ -31,6 +34,8 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
     """
     n, m = model.num_coordinates, model.num_inputs
     sizes = {"q": n, "v": n, "a": n, "u": m, "u_next": m, "h": None}
+    past = model.past_steps
+    sizes |= {"q_past": past * n, "u_past": past * m, "memory": getattr(model, "memory_size", 0)}
     steps = torch.tensor([5e-4, 1.5e-3], dtype=torch.float64)
     states = drawn_states(sizes, {"h": (steps[0], steps[1]), **(ranges or {})})
 
@@ -73,13 +78,21 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
         ]
     elif isinstance(model, ContinuousPredictor):
         functions = [(forward_dynamics, "q v u", "a", "Acceleration a."), last]
+    elif sizes["memory"]:
+        about = f"State after {model.fixed_step:g} s, with u at its start and end."
+        begin = "Memory of a rollout. Of q_past and u_past, the latest samples come first."
+        latent: Any = model
+        functions = [
+            (latent.next_state, "memory u u_next", "memory_next q_next v_next", about),
+            (latent.start, "q v u q_past u_past", "memory", begin),
+        ]
     elif hasattr(model, "increment"):
         about = f"State after {model.fixed_step:g} s, with u at its start and end."
         functions = [(next_state, "q v u u_next", "q_next v_next", about)]
     else:
         raise TypeError(
-            f"a {type(model).__name__} has no function of a state (q, v) to export: export a model "
-            "without a memory, or a single member of an ensemble, such as run.members[0]"
+            f"a {type(model).__name__} has no function of a state to export: export a single "
+            "member of an ensemble, such as run.members[0]"
         )
     return [exported(*function) for function in functions]
 

@@ -31,6 +31,7 @@ from pinn_dyn.models.known_system import KnownSystem
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.modes import Modes
 from pinn_dyn.models.oscillators import CoupledOscillators
 from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
@@ -63,6 +64,7 @@ __all__ = [
     "LagrangianNetwork",
     "LearnedConstants",
     "LearnedVelocity",
+    "Modes",
     "NetworkCholesky",
     "NetworkInput",
     "NetworkPotential",

@@ -3,21 +3,48 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
+from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.mlp import Activation
+from pinn_dyn.models.modes import Modes, modes_of
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.subspace_encoder import EncodedPredictor, LinearAndMLP
 
-_SLOWEST, _FASTEST = 0.05, 1.5  # initial eigenfrequencies, rad in a step
+_SLOWEST, _FASTEST = 0.4, 1.2  # initial eigenfrequencies, rad in a step
 _DAMPING = 0.5  # initial damping ratio
-_SPREAD = 0.5  # initial entries of the factors of K and D, times the root of n
+_SPREAD = 0.3  # initial entries of the factors of K and D, times the root of n
+_COUPLING = 0.1  # initial entries of W, times the root of n
+_NEWTON_STEPS, _HALVINGS = 100, 8
+
+
+class Linearization(NamedTuple):
+    """Equilibrium of oscillators under a constant input, and slopes there.
+
+    Attributes:
+        z, q: latent coordinates ``(*batch, n)`` and configuration ``(*batch, N)`` at rest.
+        stiffness: Hessian of V, ``(*batch, n, n)``.
+        input: df/du, ``(*batch, n, M)``.
+        output: dq/dx for x = (z, z'), ``(*batch, N, 2n)``.
+    """
+
+    z: Tensor
+    q: Tensor
+    stiffness: Tensor
+    input: Tensor
+    output: Tensor
+
+
+def _slopes(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Return dy/dx ``(*batch, n, m)`` of y = f(x) ``(*batch, n)``, row by row."""
+    rows = torch.func.vmap(torch.func.jacrev(function))(x.reshape(-1, x.shape[-1]))
+    return rows.reshape(*x.shape[:-1], *rows.shape[1:])
 
 
 class CoupledOscillators(EncodedPredictor):
@@ -32,13 +59,17 @@ class CoupledOscillators(EncodedPredictor):
     potential, so the system with a constant input has one equilibrium, which is globally stable,
     and it is input-to-state stable.
 
-    A step is exact for the linear part, by a matrix exponential. The force, the mean of f at both
-    ends, and the coupling at the start of the step are held::
+    A step takes the forces at the mean of z at both ends, and the coupling by its slope at the
+    start and the bound W^T W of its Hessian::
 
-        x_{k+1} = E x_k + G (f - W^T tanh(W z_k + b)),      x = (z, z')
+        w = (2 I + K/2 + D + W^T W/2)^-1 (2 z' + f - K z - W^T tanh(W z + b))
+        z_{k+1} = z + w,      z'_{k+1} = 2 w - z',      w = (z' + z'_{k+1}) / 2
 
-    All rollouts are bounded at any step: E is the flow of damped oscillators, whose powers vanish,
-    and the held force is bounded by that of the inputs and by the norm of W.
+    with f the mean of its values at both ends. For any parameters and any step, the energy
+    E = V(z) + z'^T z' / 2 changes by at most w^T f - w^T D w: the unforced system never gains
+    energy, since log cosh lies below its expansion with the Hessian bound. All rollouts are
+    bounded: the linear part x_{k+1} = A x_k, with the coupling as a force, decays to zero, and the
+    force is bounded by that of the inputs and by the norm of W.
 
     Source: Stölzle and Della Santina (2024), "Input-to-state stable coupled oscillator networks for
     closed-form model-based control in latent space". The encoder and the output are those of
@@ -74,7 +105,7 @@ class CoupledOscillators(EncodedPredictor):
         self.stiffness = nn.Parameter(torch.diag(frequency) + mixed[0].tril(-1))
         damping = (frequency + math.log(2 * _DAMPING)) / 2
         self.damping = nn.Parameter(torch.diag(damping) + mixed[1].tril(-1))
-        self.coupling = nn.Parameter(torch.randn(n, n) / n**0.5)
+        self.coupling = nn.Parameter(_COUPLING * torch.randn(n, n) / n**0.5)
         self.bias = nn.Parameter(torch.randn(n))
 
     def matrices(self) -> tuple[Tensor, Tensor]:
@@ -86,22 +117,118 @@ class CoupledOscillators(EncodedPredictor):
         K, D = (factor @ factor.T for factor in factors)
         return K, D
 
-    def flow(self) -> tuple[Tensor, Tensor]:
-        """Return E ``(2n, 2n)`` and G ``(2n, n)`` of a step."""
+    def flow(self, ratio: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Return A ``(2n, 2n)`` and B ``(2n, n)`` of a step x_{k+1} = A x_k + B force.
+
+        Args:
+            ratio: length of the step in steps of the training windows.
+        """
         K, D = self.matrices()
-        zero, one = torch.zeros_like(K), torch.eye(len(K)).to(K)
-        rows = [[zero, one, zero], [-K, -D, one], [zero, zero, zero]]
-        flow = torch.matrix_exp(torch.cat([torch.cat(row, dim=1) for row in rows]))
-        return flow[: 2 * len(K), : 2 * len(K)], flow[: 2 * len(K), 2 * len(K) :]
+        one = torch.eye(len(K)).to(K)
+        bound = K + self.coupling.T @ self.coupling
+        S = torch.linalg.inv(2 * one + ratio**2 / 2 * bound + ratio * D)
+        A = torch.cat([torch.cat([one, 0 * one], dim=1), torch.cat([0 * one, -one], dim=1)])
+        B = torch.cat([ratio * S, 2 * S])
+        return A + B @ torch.cat([-ratio * K, 2 * one], dim=1), ratio * B
+
+    def coupling_force(self, z: Tensor) -> Tensor:
+        """Return W^T tanh(W z + b), ``(*batch, n)``."""
+        return torch.tanh(F.linear(z, self.coupling, self.bias)) @ self.coupling
+
+    def latent_force(self, u: Tensor) -> Tensor:
+        """Return f(u), ``(*batch, n)``, at u ``(*batch, M)``."""
+        size = self.num_inputs
+        return self.force((u - self._input_mean[:size]) / self._input_std[:size])
+
+    def stiffness_at(self, z: Tensor) -> Tensor:
+        """Return the Hessian of V, ``(*batch, n, n)``."""
+        slope = 1 - torch.tanh(F.linear(z, self.coupling, self.bias)).square()
+        return self.matrices()[0] + self.coupling.T @ (slope.unsqueeze(-1) * self.coupling)
+
+    def equilibrium(self, force: Tensor, start: Tensor | None = None) -> Tensor:
+        """Return z with K z + W^T tanh(W z + b) = force, ``(*batch, n)``, in float64.
+
+        Newton's method minimizes the convex function V(z) - z^T force. A step is halved until its
+        end has the slope of a descent.
+
+        Raises:
+            RuntimeError: if it does not converge.
+        """
+        K, _ = self.matrices()
+        bound = K + self.coupling.T @ self.coupling
+        z = torch.linalg.solve(bound, force.unsqueeze(-1))[..., 0] if start is None else start
+        for _ in range(_NEWTON_STEPS):
+            slope = F.linear(z, K) + self.coupling_force(z) - force
+            step = torch.linalg.solve(self.stiffness_at(z), slope.unsqueeze(-1))[..., 0]
+            # NaN is returned.
+            if not bool((slope.norm(dim=-1) > 1e-9 * (1 + force.norm(dim=-1))).any()):
+                return z - step  # with the derivative of z
+            length = torch.ones_like(z[..., :1])
+            for _ in range(_HALVINGS):
+                end = z - length * step
+                ahead = F.linear(end, K) + self.coupling_force(end) - force
+                beyond = (ahead * step).sum(-1, keepdim=True) < -0.5 * (slope * step).sum(
+                    -1, keepdim=True
+                )
+                length = torch.where(beyond, length / 2, length)
+            z = z - length * step
+        raise RuntimeError(f"no equilibrium was found within {_NEWTON_STEPS} steps of Newton")
+
+    def rest(self, u: Tensor, start: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return z and q of the equilibrium under a constant u, ``(*batch, n or N)``, in float64.
+
+        Args:
+            u: input, ``(*batch, M)``.
+            start: z to start from, such as that of a similar input.
+
+        Raises:
+            RuntimeError: see :meth:`equilibrium`.
+        """
+        z = self.equilibrium(self.latent_force(u), start)
+        return z, self.observe(torch.cat([z, torch.zeros_like(z)], dim=-1))
+
+    def observe(self, x: Tensor) -> Tensor:
+        """Return q ``(*batch, N)`` of the latent state x = (z, z')."""
+        size = self.num_coordinates
+        return self.mean[:size] + self.std[:size] * self.output(x)[..., :size]
+
+    def linearize(self, u: Tensor, start: Tensor | None = None) -> Linearization:
+        """Return the slopes of the model at its equilibrium, see :meth:`rest`."""
+        z, q = self.rest(u, start)
+        x = torch.cat([z, torch.zeros_like(z)], dim=-1)
+        slopes = _slopes(self.latent_force, u), _slopes(self.observe, x)
+        return Linearization(z, q, self.stiffness_at(z), *slopes)
+
+    def transition(self, at: Linearization, ratio: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Return A ``(2n, 2n)`` and B ``(2n, M)`` of a linearized step, see :meth:`flow`."""
+        n = len(self.bias)
+        A, B = self.flow(ratio)
+        A = A - F.pad(B @ (at.stiffness - self.matrices()[0]), (0, n))
+        return A, B @ at.input
+
+    def modes(self, u: Tensor | None = None) -> Modes:
+        """Return the modes of the model at its equilibrium under a constant input.
+
+        The model is linearized in float64 over a step of the training windows, so that poles are
+        those of its predictions. Poles faster than the step allows stand at half of its rate.
+
+        Args:
+            u: input, ``(M,)``; None takes the mean of the training data.
+        """
+        model, size = double_copy(self).requires_grad_(False), self.num_coordinates
+        u = model._input_mean[: model.num_inputs] if u is None else u.double()
+        at = model.linearize(u)
+        A, B = model.transition(at)
+        B = B * model._input_std[: model.num_inputs]
+        return modes_of(A, B, at.output, step=model.fixed_step, spread=model.std[:size])
 
     def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
         n = len(self.bias)
-        E, G = self.flow()
+        A, B = self.flow()
         start, end = ends.chunk(2, dim=-1)
-        drives = F.linear((self.force(start) + self.force(end)) / 2, G)
+        drives = F.linear((self.force(start) + self.force(end)) / 2, B)
         path = [z]
         for drive in drives:
-            coupling = torch.tanh(F.linear(z[..., :n], self.coupling, self.bias)) @ self.coupling
-            z = F.linear(z, E) + drive - F.linear(coupling, G)
+            z = F.linear(z, A) + drive - F.linear(self.coupling_force(z[..., :n]), B)
             path.append(z)
         return path

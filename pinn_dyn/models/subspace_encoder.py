@@ -59,8 +59,8 @@ class EncodedPredictor(Predictor):
     output are sums of a linear map and an MLP. The last term starts the prediction at the measured
     y_0. fade is learned, between 0 and 1. Subclasses define how z moves (:meth:`latent_path`).
 
-    Unknown q and u before the start repeat the first sample: the robot was at rest. The model has
-    no function of (q, v) for control laws and exports.
+    Unknown q and u before the start repeat the first sample: the robot was at rest. The memory of a
+    rollout is z and the fading term, see :meth:`start` and :meth:`next_state`.
 
     Source: Beintema, Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system
     identification". The fading term is not part of it.
@@ -97,6 +97,7 @@ class EncodedPredictor(Predictor):
         self._add_transition(inputs, latent, hidden, activation)
         self.output = LinearAndMLP(latent, 2 * size, hidden, activation)
         self.fade = nn.Parameter(torch.zeros(2 * size))
+        self.memory_size = latent + 2 * size
 
     @abc.abstractmethod
     def _add_transition(
@@ -118,6 +119,38 @@ class EncodedPredictor(Predictor):
         """Step of the training windows, s."""
         return float(self.step)
 
+    def start(self, q: Tensor, v: Tensor, u: Tensor, q_past: Tensor, u_past: Tensor) -> Tensor:
+        """Return the memory of a rollout, ``(*batch, latent + 2N)``: z and y - output(z).
+
+        Args:
+            q, v, u: present state and input, ``(*batch, N or M)``.
+            q_past, u_past: q and u of the n steps before, the latest first, ``(*batch, n N)`` and
+                ``(*batch, n M)``.
+        """
+        x = (torch.cat([q, v, q_past, u, u_past], dim=-1) - self.mean) / self.std
+        z = self.encoder(x)
+        return torch.cat([z, x[..., : 2 * self.num_coordinates] - self.output(z)], dim=-1)
+
+    def next_state(
+        self, memory: Tensor, u: Tensor, u_next: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the memory, q and v a step later, from u at the start and the end of the step."""
+        size = 2 * self.num_coordinates
+        z, offset = memory.tensor_split([memory.shape[-1] - size], dim=-1)
+        ends = (torch.cat([u, u_next], dim=-1) - self._input_mean) / self._input_std
+        z = self.latent_path(z, ends[None])[1]
+        offset = torch.sigmoid(self.fade) * offset
+        y = self.mean[:size] + self.std[:size] * (self.output(z) + offset)
+        return torch.cat([z, offset], dim=-1), *y.chunk(2, dim=-1)
+
+    @property
+    def _input_mean(self) -> Tensor:
+        return self.mean[len(self.mean) - self.num_inputs :].repeat(2)
+
+    @property
+    def _input_std(self) -> Tensor:
+        return self.std[len(self.std) - self.num_inputs :].repeat(2)
+
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         """Apply the model step by step.
 
@@ -132,8 +165,8 @@ class EncodedPredictor(Predictor):
         past = torch.cat([past, *input.at(before).to(x0)], dim=-1)
         z = self.encoder((past - self.mean) / self.std)
         ends = torch.cat(input.stages(t, (0.0, 1.0)).to(x0).unbind(1), dim=-1)
-        mean, std = (x[len(x) - self.num_inputs :].repeat(2) for x in (self.mean, self.std))
-        y = self.output(torch.stack(self.latent_path(z, (ends - mean) / std), dim=-2))
+        ends = (ends - self._input_mean) / self._input_std
+        y = self.output(torch.stack(self.latent_path(z, ends), dim=-2))
         mean, std = self.mean[: 2 * size], self.std[: 2 * size]
         offset = (x0[..., None, : 2 * size] - mean) / std - y[..., :1, :]
         steps = torch.arange(len(t), device=t.device)[:, None]

@@ -15,6 +15,7 @@ from pinn_dyn.exports.exported import ENDINGS, Ranges, Real, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
+from pinn_dyn.models.subspace_encoder import EncodedPredictor
 from pinn_dyn.systems import HasDomain, RigidChain
 from pinn_dyn.systems.robot_files import RobotConstants, new_mjcf, updated_urdf
 
@@ -75,6 +76,8 @@ def export(
         "num_inputs": model.num_inputs,
         **(about or {}),
     }
+    if isinstance(model, EncodedPredictor):
+        info["memory_size"] = model.memory_size
     return write([f for f in functions if what in (None, f.name)], path, info, real)
 
 

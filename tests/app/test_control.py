@@ -25,6 +25,7 @@ from tests.app.entry import (
     TINY_TRAINING,
     refused_text,
     run_script,
+    train,
 )
 from tests.app.pages import assert_says_how_it_came_about, page_of
 from tests.support.c_code import function_of
@@ -239,6 +240,35 @@ def test_a_black_box_has_no_terms_to_control_by(capsys, mlp_run):
     text = refused(capsys, mlp_run)
     assert "black box" in text
     assert "model=lnn" in text
+
+
+@pytest.fixture(scope="module")
+def oscillators_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "oscillators"
+    return train(folder, "model=oscillators", "data.steps=5", "data.history=0", NO_FIGURES)
+
+
+def test_oscillators_control_beside_pid_and_the_true_terms(tmp_path, oscillators_run, undrawn):
+    folder = control(tmp_path / "out", oscillators_run, "controllers=latent", "rate=100")
+    summary = pd.read_csv(folder / "summary.csv").set_index("controller")
+    assert list(summary.index) == ["learned", "pid", "truth"]
+    assert np.isfinite(summary["rms_error"]).all()
+    record = np.load(folder / "record_learned.npz")
+    assert np.isfinite(record["static_residual"]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["guard.threshold=1"], "guard: a law on oscillators has no guard"),
+        (["stability={region: r, q_low: [0,0,0], q_high: [1,1,1], samples: 5}"], "stability"),
+        (["export=law.c"], "export=law.c"),
+        (["controllers=regulation"], "CoupledOscillators"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
+)
+def test_oscillators_have_no_terms_for_other_tasks(capsys, oscillators_run, arguments, part):
+    assert part in refused(capsys, oscillators_run, "controllers=latent", "rate=100", *arguments)
 
 
 @pytest.mark.slow

@@ -22,8 +22,10 @@ from pinn_dyn.evaluation import (
     tip_path_figure,
     trajectory_figure,
 )
+from pinn_dyn.evaluation.figures import modes_figure
 from pinn_dyn.evaluation.plots import BASELINE, log_limits
 from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.models.modes import modes_of
 from pinn_dyn.systems import SoftArm
 
 
@@ -193,3 +195,32 @@ def test_a_logarithmic_axis_shows_where_a_converging_curve_starts():
     low, high = log_limits([fast, 1e6 * torch.ones(100)])
     assert low < 1e-6
     assert 1 <= high < 10
+
+
+def test_modes_have_their_frequencies_dampings_and_shapes():
+    """Two decoupled damped oscillators of 1 Hz and 3 Hz, sampled every 10 ms."""
+    step, frequency = 0.01, torch.tensor([1.0, 3.0]).double()
+    damping, spread = torch.tensor([0.1, 0.5]).double(), torch.tensor([0.1, 2.0]).double()
+    omega = 2 * math.pi * frequency
+    zero, one = torch.zeros(2, 2).double(), torch.eye(2).double()
+    rate = torch.cat(
+        [
+            torch.cat([zero, one], 1),
+            torch.cat([-(omega**2).diag(), -(2 * damping * omega).diag()], 1),
+        ]
+    )
+    A = torch.linalg.matrix_exp(step * rate)
+    B = torch.cat([zero, torch.diag(torch.tensor([0.01, 20.0]).double())])
+    modes = modes_of(A, B, torch.cat([one, zero], 1), step=step, spread=spread)
+    order = [1, 0]  # variance of q under white noise: B^2 / (4 damping omega^3)
+    assert torch.allclose(modes.frequency, frequency[order])
+    assert torch.allclose(modes.damping, damping[order])
+    share = B[2:].diagonal() / spread / (damping * omega**3).sqrt()
+    assert math.isclose(modes.share[1], share[0] / share[1], rel_tol=0.02)
+    assert torch.allclose(modes.relative_shapes, one[order], atol=1e-9)
+    frame = modes.to_frame(["a [m]", "b [rad]"])
+    assert math.isclose(frame["amplitude of b [rad]"][0], 2.0)
+    left, right = modes_figure(modes, title="t", labels=["a [m]", "b [rad]"]).axes
+    np.testing.assert_allclose(left.collections[0].get_offsets()[0], [3.0, 0.5])
+    names = [text.get_text() for text in right.get_yticklabels()]
+    assert names == ["1: 3 Hz, ζ 0.50", "2: 1 Hz, ζ 0.10"]

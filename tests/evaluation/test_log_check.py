@@ -195,4 +195,16 @@ def test_targets_of_servos_are_told_from_forces(settings):
 def test_inputs_in_the_unit_of_the_coordinates_are_no_targets_if_the_robot_does_not_follow():
     """Motors of tendons, or torques without a unit."""
     signals = {name: dict(columns=[f"{name}1", f"{name}2"], unit="m") for name in "qu"}
-    assert "model/input=servo" not in checked(driven(), **signals).options
+    result = checked(driven(), **signals)
+    assert "model/input=servo" not in result.options
+    assert result.model == "oscillators"
+    stride, *more = result.options
+    # Knots every 0.2 s, so up to 2.5 Hz, and kinks that reach further.
+    assert stride in ("data.stride=10 ms", "data.stride=20 ms")
+    assert more[:2] == ["data.steps=40", "loss.velocity_weight=0.1"]
+    assert "model=oscillators 'data.stride=" in str(result)
+
+
+@pytest.mark.parametrize(("unit", "model"), [("kPa", "oscillators"), ("N", "lnn"), ("A", "lnn")])
+def test_the_unit_of_the_inputs_selects_the_model(unit, model):
+    assert checked(driven(), u=dict(columns=["u1", "u2"], unit=unit)).model == model

@@ -28,9 +28,11 @@ MODELS = {
     "rigid-chain": lambda: RigidChain(ARM),
     "acceleration": lambda: make_model("acceleration"),
     "next_state": lambda: make_model("next_state"),
+    "subnet": lambda: make_model("subnet"),
+    "oscillators": lambda: make_model("oscillators"),
 }
 CONSTANT = "constant-mass-fixed-damping-constant-input-3x3"
-FAST = (CONSTANT, "acceleration", "next_state")
+FAST = (CONSTANT, "acceleration", "next_state", "oscillators")
 CASES = [pytest.param(x, marks=() if x in FAST else pytest.mark.slow, id=x) for x in MODELS]
 
 

@@ -1,5 +1,7 @@
 """Coupled oscillators in latent coordinates: equations, and bounded rollouts."""
 
+import math
+
 import numpy as np
 import pytest
 import scipy
@@ -23,14 +25,19 @@ def oscillators(seed=0, spread=0.3):
     return model.double().requires_grad_(False)
 
 
-def test_a_step_is_that_of_the_held_force():
-    """The exact flow of the linear part by SciPy, with a force that is constant in the step."""
-    model = oscillators()
+def factors(model):
+    """K, D, W and b in NumPy."""
     L_K, L_D = (
         np.tril(x.numpy(), -1) + np.diag(np.exp(np.diag(x.numpy())))
         for x in (model.stiffness, model.damping)
     )
-    K, D, W, b = L_K @ L_K.T, L_D @ L_D.T, model.coupling.numpy(), model.bias.numpy()
+    return L_K @ L_K.T, L_D @ L_D.T, model.coupling.numpy(), model.bias.numpy()
+
+
+def test_a_step_solves_the_equation_of_motion_at_the_mean_state():
+    """The implicit equation of a step, solved by SciPy."""
+    model = oscillators()
+    K, D, W, b = factors(model)
     x0, u = torch.randn(4).double(), torch.randn(6, 2).double()
     s = make_statistics(2, 2)
     ends = (u.numpy() - s.u_mean.numpy()) / s.u_std.numpy()
@@ -39,12 +46,15 @@ def test_a_step_is_that_of_the_held_force():
     y = [network(model.output, x)]
     for k in range(5):
         force = (network(model.force, ends[k]) + network(model.force, ends[k + 1])) / 2
-        force = force - W.T @ np.tanh(W @ x[:N] + b)
+        z, v = np.split(x, 2)
 
-        def rate(_, x, force=force):
-            return [*x[N:], *(force - K @ x[:N] - D @ x[N:])]
+        def residual(later, z=z, v=v, force=force):
+            z_next, v_next = np.split(later, 2)
+            coupling = W.T @ (np.tanh(W @ z + b) + W @ (z_next - z) / 2)
+            acceleration = force - K @ (z + z_next) / 2 - D @ (v + v_next) / 2 - coupling
+            return np.concatenate([z_next - z - (v + v_next) / 2, v_next - v - acceleration])
 
-        x = scipy.integrate.solve_ivp(rate, (0, 1), x, rtol=1e-10, atol=1e-12).y[:, -1]
+        x = scipy.optimize.root(residual, x, tol=1e-13).x
         y.append(network(model.output, x))
     fade = 1 / (1 + np.exp(-model.fade.numpy()))
     start = (x0.numpy() - mean[:4]) / std[:4]
@@ -54,19 +64,63 @@ def test_a_step_is_that_of_the_held_force():
     assert_near(found, torch.from_numpy(mean[:4] + std[:4] * np.array(path)), 1e-7)
 
 
+def test_a_step_follows_the_equation_of_motion():
+    """A system slower by s with coordinates larger by s, against SciPy's solution of the ODE."""
+    errors = []
+    for slow in (8.0, 16.0):
+        model = oscillators(spread=0.1)
+        with torch.no_grad():
+            model.stiffness.copy_(torch.diag(model.stiffness.diagonal() - math.log(slow)))
+            model.damping.copy_(torch.diag(model.damping.diagonal() - math.log(slow) / 2))
+            model.coupling.div_(slow)
+            model.force.first.bias[:N].fill_(1 / slow)
+            model.force.first.weight.zero_()
+            model.force.layers[-1].weight.zero_()
+            model.force.layers[-1].bias.zero_()
+        K, D, W, b = factors(model)
+        x = np.concatenate([slow * np.ones(N), np.zeros(N)])
+
+        def rate(_, x, K=K, D=D, W=W, b=b, slow=slow):
+            z, v = np.split(x, 2)
+            return np.concatenate([v, 1 / slow - K @ z - D @ v - W.T @ np.tanh(W @ z + b)])
+
+        steps = int(2 * slow)
+        exact = scipy.integrate.solve_ivp(rate, (0, steps), x, rtol=1e-10, atol=1e-12).y[:N, -1]
+        path = model.latent_path(torch.from_numpy(x), torch.zeros(steps, 4).double())
+        errors.append(np.linalg.norm(path[-1][:N].numpy() - exact) / slow)
+    assert errors[1] < 0.6 * errors[0] < 0.1
+
+
+@pytest.mark.parametrize("spread", [0.3, 2.0])
+def test_energy_never_rises_under_a_constant_input(spread):
+    """The energy with the potential of the constant force, from far starts, at any parameters."""
+    for seed in range(10):
+        model = oscillators(seed, spread)
+        K, _, W, b = (torch.from_numpy(x) for x in factors(model))
+        far = 10 ** (seed % 4) * torch.randn(3, 2 * N, generator=torch.manual_seed(seed)).double()
+        path = torch.stack(model.latent_path(far, torch.ones(300, 3, 4).double()))
+        z, v = path.split(N, dim=-1)
+        x = z @ W.T + b
+        log_cosh = x.abs() + torch.log1p(torch.exp(-2 * x.abs())) - math.log(2)
+        force = model.force(torch.ones(2).double())
+        energy = (z @ K * z).sum(-1) / 2 + log_cosh.sum(-1) + v.square().sum(-1) / 2 - z @ force
+        assert energy.diff(dim=0).max() <= 1e-9 * energy.abs().max()
+        assert energy[-1].max() < energy[0].min()
+
+
 @pytest.mark.parametrize("spread", [0.3, 2.0])
 def test_rollouts_are_bounded_for_any_parameters(spread):
     """The energy of the linear part never rises; bounded inputs keep all starts bounded."""
     for seed in range(10):
         model = oscillators(seed, spread)
         K, _ = model.matrices()
-        E, G = model.flow()
+        A, B = model.flow()
         energy = torch.block_diag(K, torch.eye(N)).double()
         root = torch.linalg.cholesky(energy).T
         back = torch.linalg.inv(root)
-        norm = torch.linalg.matrix_norm(root @ E @ back, 2)
+        norm = torch.linalg.matrix_norm(root @ A @ back, 2)
         assert norm <= 1 + 1e-9
-        power = torch.linalg.matrix_power(root @ E @ back, 2**20)
+        power = torch.linalg.matrix_power(root @ A @ back, 2**20)
         assert power.abs().max() < 1  # it vanishes
         u = 5 * torch.randn(3, 2001, 4, generator=torch.manual_seed(seed)).double()
         ends = u[:, :-1].movedim(0, 1)
@@ -74,7 +128,46 @@ def test_rollouts_are_bounded_for_any_parameters(spread):
         start, end = ends.chunk(2, dim=-1)
         force = (model.force(start) + model.force(end)).norm(dim=-1).max() / 2
         largest = force + torch.linalg.matrix_norm(model.coupling, 2) * N**0.5
-        step = torch.linalg.matrix_norm(root @ G, 2) * largest
+        step = torch.linalg.matrix_norm(root @ B, 2) * largest
         path = torch.stack(model.latent_path(far, ends)) @ root.T
         growth = path.norm(dim=-1).diff(dim=0).max()
         assert growth <= step * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.1, 1.0])
+def test_modes_are_those_of_a_difference_quotient_of_a_step(spread):
+    """Eigenvalues and vectors by NumPy, at the state where a long rollout comes to rest."""
+    model = oscillators(3, spread)
+    u = torch.tensor([0.3, -0.2]).double()
+    memory = torch.zeros(2 * N + 4).double()
+    for _ in range(3000):
+        memory, *_ = model.next_state(memory, u, u)
+    rest = memory[: 2 * N]
+    assert_near(model.equilibrium(model.latent_force(u)), rest[:N], 1e-7)
+
+    def step(x):
+        later, q, _ = model.next_state(torch.cat([x, torch.zeros(4).double()]), u, u)
+        return later[: 2 * N].numpy(), q.numpy()
+
+    size = 1e-5
+    sides = [[step(rest + s * size * e) for e in torch.eye(2 * N).double()] for s in (1, -1)]
+    A, C = (
+        np.stack([(a[k] - b[k]) / (2 * size) for a, b in zip(*sides, strict=True)], axis=-1)
+        for k in (0, 1)
+    )
+    values, vectors = np.linalg.eig(A)
+    kept = values.imag >= -1e-12
+    poles = np.log(values[kept].astype(complex)) / STEP
+    modes = model.modes(u)
+    assert modes.share[0] == 1
+    assert (modes.share.diff() <= 0).all()
+    for k, pole in enumerate(poles):
+        distance = np.abs(modes.frequency.numpy() - abs(pole) / (2 * np.pi))
+        index = int(distance.argmin())
+        assert distance[index] < 1e-4 * abs(pole)
+        assert abs(modes.damping[index] + pole.real / abs(pole)) < 1e-4
+        # q after the step is C times the vector, times the eigenvalue.
+        shape, expected = modes.shapes[index].numpy(), C @ vectors[:, kept][:, k]
+        cosine = abs(np.vdot(shape, expected)) / np.linalg.norm(shape) / np.linalg.norm(expected)
+        assert cosine > 1 - 1e-6
+    assert len(modes.to_frame(["a [m]", "b [m]"])) == len(poles)

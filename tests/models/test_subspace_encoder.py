@@ -8,7 +8,6 @@ import torch
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.evaluation.prediction import predict_trajectories
-from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 from pinn_dyn.models import NextStateMLP, SubspaceEncoder
 from pinn_dyn.testing import assert_near
@@ -108,9 +107,17 @@ def test_the_history_has_all_steps_that_fit():
     assert SubspaceEncoder(statistics, history=0.3).past_steps == 3  # 0.3 / 0.1 is below 3
 
 
-def test_exports_refuse_a_model_with_a_memory(model):
-    with pytest.raises(TypeError, match="export a model without a memory"):
-        model_functions(model)
+def test_steps_with_a_memory_repeat_a_rollout(model):
+    q, v, _, _ = random_batch(2, 2)
+    u = motion(5, seed=1).u.expand(len(q), -1, -1)
+    past = motion(3, seed=2).u.expand(len(q), -1, -1)
+    x0 = torch.cat([q, v, *past.unbind(1)], -1)
+    before = STEP * torch.arange(-3, 5, dtype=torch.float64)
+    expected = model.predict(x0, T, Signal(before, torch.cat([past.flip(1), u], 1)))
+    memory = model.start(q, v, u[:, 0], past.flatten(1), past.flatten(1))
+    for k in range(4):
+        memory, q, v = model.next_state(memory, u[:, k], u[:, k + 1])
+        assert_near(torch.cat([q, v], -1), expected[:, k + 1], 1e-12)
 
 
 def lagging_actuator(samples, seed):

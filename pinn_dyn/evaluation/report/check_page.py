@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,8 +55,10 @@ class LogCheck:
         delays: delay curve of each input.
         steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
         delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
-        options: options of a training: heads for dry friction or servos, if needed; none if an
-            angle turns too far in a sample for a step.
+        options: options of a training: heads for dry friction or servos, or windows of oscillators,
+            if needed; none if an angle turns too far in a sample for a step.
+        model: model of a training: oscillators for inputs that are positions or pressures of
+            motors, which the coordinates do not follow, of a robot without a structure; else lnn.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
         motion: averages of the motion, or None if it is too short for an equation of motion.
         equations: equations of motion of the log.
@@ -70,6 +73,7 @@ class LogCheck:
     steps: list[str]
     delay: float | list[float] | None
     options: list[str]
+    model: str = "lnn"
     rigid: RigidExcitation | None = None
     motion: Averages | None = None
     equations: Sequence[logs.Equation] = ()
@@ -78,6 +82,17 @@ class LogCheck:
     def problems(self) -> list[str]:
         """Reasons why a training makes no sense."""
         return [x.text for x in self.measurements if x.verdict == "stop"]
+
+    @property
+    def advice(self) -> str:
+        """Model and options of a training."""
+        options = f"model={self.model} {shlex.join(self.options)}"
+        if self.model == "lnn":
+            return f"Options of a training: {options}"
+        return (
+            "The inputs are positions or pressures of motors, no forces: a soft robot has more "
+            f"modes than coordinates. Options of a training: {options}"
+        )
 
     @property
     def warnings(self) -> list[str]:
@@ -139,7 +154,7 @@ class LogCheck:
         if self.block:
             lines += ["", "Append to the data set:", "", self.block]
         if self.options and self.rigid is None:
-            lines += ["", f"Options of a training: model=lnn {' '.join(self.options)}"]
+            lines += ["", self.advice]
         return "\n".join(lines)
 
     def save(self, folder: str | Path, command: str = "") -> Path:
@@ -169,7 +184,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
         text = "Entries that follow from the measured delay and noise, to append to the data set:"
         verdict += [paragraph(text), preformatted(check.block)]
     if check.options and check.rigid is None:
-        verdict.append(paragraph(f"Options of a training: model=lnn {' '.join(check.options)}"))
+        verdict.append(paragraph(check.advice))
     cleaning = cleaning_figure(
         source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
     )

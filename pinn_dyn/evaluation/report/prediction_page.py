@@ -19,6 +19,7 @@ from pinn_dyn.evaluation.figures import (
     ERROR,
     calibration_figure,
     error_figure,
+    modes_figure,
     terms_figure,
     trajectory_figure,
 )
@@ -44,10 +45,12 @@ from pinn_dyn.evaluation.tables import (
     write_table,
 )
 from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.models.modes import Modes
 
 SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
 MAX_TRAJECTORIES = 20
 """Largest number of trajectories that the slider offers."""
+_MODES = 12  # number of modes in the table of the page
 _TORQUE = (
     "Error of the inverse dynamics on the same motions: RMS of τ̂ − τ with τ = A(q) u, spread of τ, "
     "and their ratio."
@@ -74,6 +77,7 @@ class Evaluation:
         predictions: rollouts by name of the row, baselines included.
         intervals: calibration by run and window in s; runs without members have none.
         terms: learned terms beside the true ones, by run; empty where the truth is unknown.
+        modes: modes of the models of oscillators at the mean input, by run.
         constants: tables of fitted constants, by run.
         origin: command, commit, data and configurations, for the page.
     """
@@ -89,6 +93,7 @@ class Evaluation:
     predictions: dict[str, Prediction]
     intervals: dict[str, dict[float, Calibration]]
     terms: dict[str, TermComparison]
+    modes: Mapping[str, Modes] = field(default_factory=dict)
     constants: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     origin: Any = None
 
@@ -151,10 +156,13 @@ class Evaluation:
                 text = f"{run}: learned and true terms, {name}"
                 figure = terms_figure(comparison, configuration=k, title=text)
                 yield f"terms_{_stem(run)}_{name}", figure
+        for run, modes in self.modes.items():
+            text = f"{run}: modes at the mean input"
+            yield f"modes_{_stem(run)}", modes_figure(modes, title=text, labels=labels)
 
     def save(self, folder: str | Path, trajectory: int = 0) -> None:
         """Write the tables as CSV, the figures as PNG, and the page ``report.html``."""
-        folder = Path(folder)
+        folder, labels = Path(folder), self.source.labels
         tables = {
             "summary": self.summary,
             "by_model": self.by_model,
@@ -163,6 +171,7 @@ class Evaluation:
             "parts": self.parts,
         }
         tables |= {f"terms_{_stem(run)}": x.to_frame() for run, x in self.terms.items()}
+        tables |= {f"modes_{_stem(run)}": x.to_frame(labels) for run, x in self.modes.items()}
         for stem, frame in tables.items():
             if len(frame):
                 write_table(frame, folder, stem)
@@ -190,6 +199,7 @@ def prediction_report(
         "Parts": _table(item.parts, _PARTS),
         "Intervals": _intervals(item, figures),
         "Learned and true terms": _terms(item, figures),
+        "Modes": _modes(item, figures),
     }
     pages = [Section(title, [*parts]) for title, parts in sections.items()]
     pages = [section for section in pages if section.parts]
@@ -281,3 +291,19 @@ def _terms(item: Evaluation, figures: Mapping[str, Figure]) -> Iterator[Markup]:
         if name.startswith("terms_"):
             title = figure.get_suptitle().splitlines()[0]
             yield details(title, drawing(figure, title))
+
+
+def _modes(item: Evaluation, figures: Mapping[str, Figure]) -> Iterator[Markup]:
+    if item.modes:
+        yield paragraph(
+            "Eigenfrequencies, damping ratios and shapes of the model, linearized at its "
+            "equilibrium under the mean input of the training data. The modes are sorted by their "
+            "share: the standard deviation of q due to a mode alone, in relation to the strongest "
+            "mode, if the inputs are white noise. Only what recurs with other seeds belongs to the "
+            "robot. The files modes_<run>.csv hold all modes."
+        )
+    for run, modes in item.modes.items():
+        title = f"{run}: modes at the mean input"
+        yield drawing(figures[f"modes_{_stem(run)}"], title)
+        frame = modes.to_frame(item.source.labels).head(_MODES)
+        yield details(f"{run}: table of the strongest modes", table(frame))
