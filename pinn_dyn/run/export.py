@@ -10,10 +10,11 @@ from typing import Any
 import torch
 
 from pinn_dyn import __version__
+from pinn_dyn.control.external_torque import NAME, external_torque_function
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.exports.exported import ENDINGS, Ranges, Real, write
 from pinn_dyn.exports.model_functions import model_functions
-from pinn_dyn.mechanics import Predictor, double_copy
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
 from pinn_dyn.systems import HasDomain, RigidChain
 from pinn_dyn.systems.robot_files import RobotConstants, new_mjcf, updated_urdf
@@ -43,7 +44,8 @@ def export(
         model: a model or a known system.
         path: the file.
         what: name of the function. The default is all functions in a ``.c`` file, otherwise
-            ``forward_dynamics``, or ``next_state`` of a model without it.
+            ``forward_dynamics``, or ``next_state`` of a model without it. ``external_torque`` is
+            the function of :func:`~.control.external_torque.external_torque_function`.
         real: type of the numbers in a ``.c`` or ``.onnx`` file.
         statistics: of the training data. The file is compared with the model in their ranges, or
             within [-1, 1] and the domain of the equation of motion.
@@ -63,7 +65,10 @@ def export(
         raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
     model = double_copy(model).requires_grad_(False)
     ranges = _within_domain(model) if statistics is None else ranges_of(statistics)
-    functions = model_functions(model, ranges)
+    if what == NAME and isinstance(model, MechanicalSystem):
+        functions = [external_torque_function(model, ranges)]
+    else:
+        functions = model_functions(model, ranges)
     names = [function.name for function in functions]
     if what is None and path.suffix != ".c":
         what = names[0]

@@ -21,6 +21,7 @@ from torch import Tensor
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
+from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.evaluation.payload import identify_payload
 from pinn_dyn.evaluation.prediction import model_for_rollouts
@@ -37,6 +38,7 @@ from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
 from pinn_dyn.run.build import build_source
 from pinn_dyn.run.export import export
+from pinn_dyn.run.external_torque import external_torque
 from pinn_dyn.run.predict_frame import predict_frame
 
 TRAJECTORIES = "trajectories.pt"
@@ -198,6 +200,53 @@ class Run:
         splits = loaded.load()
         runs = [*splits.train, *splits.validation, *splits.test]
         return identify_payload(self.model, self.source.load().train, runs, cutoff=cutoff)
+
+    def external_torque(
+        self,
+        frame: pd.DataFrame,
+        *,
+        bandwidth: float = 20.0,
+        false_alarms: float = 1.0,
+        quiet: pd.DataFrame | None = None,
+        link: str | None = None,
+        urdf: str | None = None,
+        moment: bool = False,
+    ) -> ExternalTorque:
+        """Find torques that neither drives nor model explain, and contacts, along a data frame.
+
+        The momentum observer (:class:`~pinn_dyn.control.DisturbanceObserver`) gives the external
+        torque of each joint through a low-pass of 1 / bandwidth s: after this time it has reached
+        63 %, and after three times 95 % of a step. Joints at rest show only what their dry friction
+        cannot hold. The frame has the columns and units of the log, and is cleaned by the same
+        steps.
+
+        Args:
+            frame: the log.
+            bandwidth: K_O, 1/s.
+            false_alarms: expected false alarms per hour, which sets the thresholds.
+            quiet: motion without a contact for the thresholds; None for the validation data.
+            link: link at which a force acts, for its wrench; see
+                :func:`~.evaluation.external_torque.link_wrench`.
+            urdf: robot of the link, for models without a structure.
+            moment: false for a force at the origin of the link, true for force and moment.
+
+        Raises:
+            TypeError: on a black box or an ensemble.
+            ValueError: without the columns of a log, a robot of the link, or enough quiet motion.
+        """
+        if self.log is None:
+            raise ValueError("the training data have no columns of a log")
+        return external_torque(
+            self.system,
+            self.log,
+            frame,
+            quiet=quiet,
+            bandwidth=bandwidth,
+            false_alarms=false_alarms,
+            link=link,
+            urdf=urdf,
+            moment=moment,
+        )
 
     @overload
     def predict(self, start: pd.DataFrame, *, threads: PositiveInt = 1) -> pd.DataFrame: ...

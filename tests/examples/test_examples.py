@@ -119,6 +119,17 @@ def test_identified_robot():
     assert len(set(torques)) == 1
 
 
+@pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
+def test_contact(home):
+    """The push of 6, -9 and 8 N from 4.0 s on is the only contact."""
+    text = run("contact.py")
+    (contact,) = re.findall(r"the frame +(\S+) +(\S+) +q", text)
+    assert 4.0 <= float(contact[0]) < 4.05 < 4.3 <= float(contact[1]) < 4.45
+    force = [float(x) for x in re.search(r"force \[N\]: \[(.*)\]", text)[1].split(",")]
+    assert force == pytest.approx([6.0, -9.0, 8.0], abs=0.5)
+    assert (home / "contact.png").stat().st_size > 10_000
+
+
 def test_reinforcement_learning(own_log):
     pytest.importorskip("gymnasium", reason="the envs extra is not installed")
     text = run("reinforcement_learning.py", RUN, "--trials=1", "--duration=0.1")
