@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 
 from pinn_dyn import __version__
@@ -81,6 +82,29 @@ def export(
         **(about or {}),
     }
     return write([f for f in functions if what in (None, f.name)], path, info, real)
+
+
+def export_samples(models: Sequence[Predictor], path: str | Path) -> Path:
+    """Write a URDF or MJCF of each model, and a table of their constants; return its path.
+
+    Raises:
+        ValueError: on another ending.
+        TypeError: as :func:`export`.
+    """
+    path = Path(path).expanduser()
+    if path.suffix not in _WRITERS:
+        raise ValueError(f"{path} ends in {path.suffix!r}: samples are .urdf or .xml files")
+    digits, rows = len(str(len(models) - 1)), []
+    for k, model in enumerate(models):
+        file = export(model, path.with_stem(f"{path.stem}_{k:0{max(digits, 2)}}"))
+        row: dict[str, Any] = {"file": file.name}
+        for part in getattr(model, "physical_constants", list)():
+            for name, unit, value in zip(part.names, part.units, part.values, strict=True):
+                row[f"{name} [{unit}]"] = float(value)
+        rows.append(row)
+    table = path.with_name(f"{path.stem}_samples.csv")
+    write_whole(table, pd.DataFrame(rows).to_csv(index=False))
+    return table
 
 
 def ranges_of(statistics: Statistics) -> Ranges:

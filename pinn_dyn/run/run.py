@@ -19,7 +19,7 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
-from pinn_dyn.ensembles import Ensemble, posterior_draws
+from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
@@ -37,7 +37,7 @@ from pinn_dyn.mechanics import (
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
 from pinn_dyn.run.build import build_source
-from pinn_dyn.run.export import export
+from pinn_dyn.run.export import export, export_samples
 from pinn_dyn.run.external_torque import external_torque
 from pinn_dyn.run.predict_frame import predict_frame
 
@@ -161,14 +161,51 @@ class Run:
         if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
             store(self._made_in_python, target / TRAJECTORIES)
 
-    def export(self, path: str | Path, what: str | None = None, *, real: Real = "double") -> Path:
+    def sample(self, n: int, seed: int = 0) -> list[Predictor]:
+        """Draw robots from the posterior of the constants that least squares fitted.
+
+        Directions that the data do not determine vary within the prior, and every body is
+        physically possible, see :func:`~pinn_dyn.ensembles.sampled_models`.
+
+        Args:
+            n: number of robots.
+            seed: seed of the draws.
+
+        Returns:
+            n models of the class of ``model``, in float64 and without gradients. All methods of a
+            model work on each, and environments for reinforcement learning take one per copy.
+
+        Raises:
+            TypeError: if the run has no covariance of constants.
+        """
+        if self.covariance is None:
+            raise TypeError("the run has no posterior: fit its constants by least squares")
+        return sampled_models(self.model, self.covariance, n, seed)
+
+    def export(
+        self,
+        path: str | Path,
+        what: str | None = None,
+        *,
+        real: Real = "double",
+        samples: int = 0,
+        seed: int = 0,
+    ) -> Path:
         """Write the model to a C, ONNX, CasADi, URDF or MJCF file, see :func:`~.run.export.export`.
 
         Args:
             path: the file; its ending selects the format.
             what: name of a function to write.
             real: type of the numbers in a ``.c`` or ``.onnx`` file, ``double`` or ``float``.
+            samples: number of draws of :meth:`sample` to write instead, as ``arm_00.xml`` and so
+                on for the path ``arm.xml``, with their constants in ``arm_samples.csv``.
+            seed: seed of the draws.
+
+        Returns:
+            The path, or that of the table of the samples.
         """
+        if samples:
+            return export_samples(self.sample(samples, seed), path)
         about = {"q": self.labels, "u": self.input_labels, "delay": self.input_delay.tolist()}
         statistics = self.statistics
         return export(self.model, path, what, real=real, statistics=statistics, about=about)

@@ -130,6 +130,15 @@ def test_contact(home):
     assert (home / "contact.png").stat().st_size > 10_000
 
 
+def test_randomized_robots(home):
+    """The draws differ most in the mass of the first body, which the motion does not determine."""
+    text = run("randomized_robots.py")
+    masses = [float(x) for x in re.findall(r"mass of link\d: .* to .*, (\S+) %", text)]
+    torque = float(re.search(r"torque: (\S+) %", text)[1])
+    assert masses[0] > 10 > 2 > torque
+    assert len(list((home / "draws").glob("pendulum_*.xml"))) == 5
+
+
 def test_reinforcement_learning(own_log):
     pytest.importorskip("gymnasium", reason="the envs extra is not installed")
     text = run("reinforcement_learning.py", RUN, "--trials=1", "--duration=0.1")
