@@ -130,6 +130,10 @@ def test_contact(home):
     assert (home / "contact.png").stat().st_size > 10_000
 
 
+def test_motion_capture(home):
+    assert "q = (mass:X [m], mass:Z [m])" in run("motion_capture.py", "--steps", "2")
+
+
 def test_randomized_robots(home):
     """The draws differ most in the mass of the first body, which the motion does not determine."""
     text = run("randomized_robots.py")
