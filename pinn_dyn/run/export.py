@@ -157,6 +157,8 @@ def _export_robot(model: Predictor, path: Path) -> Path:
         limit = torch.full_like(offset, torch.inf)
         if servo and not servo.affine:
             limit[model.driven] = servo.largest_force()
+        if model.limits is not None:
+            limit[model.driven] = model.limits.at_rest()
         springs, damping = (servo.springs(), servo.damping_rates()) if servo else 2 * [0 * offset]
         drives = model.physical_constants()[_BODY_COLUMNS:]
         fast = torch.full_like(model.viscous(), torch.inf)

@@ -134,6 +134,11 @@ def test_motion_capture(home):
     assert "q = (mass:X [m], mass:Z [m])" in run("motion_capture.py", "--steps", "2")
 
 
+def test_saturated_drive():
+    without, curve = re.findall(r"m c = (\S+) kg m", run("saturated_drive.py"))
+    assert abs(float(curve) - 0.3) < 0.005 < 0.3 < float(without) - 0.3
+
+
 def test_randomized_robots(home):
     """The draws differ most in the mass of the first body, which the motion does not determine."""
     text = run("randomized_robots.py")
