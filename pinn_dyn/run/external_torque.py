@@ -10,6 +10,7 @@ import pandas as pd
 import torch
 
 from pinn_dyn.data import LogSource
+from pinn_dyn.data.logs import Recording
 from pinn_dyn.data.logs.pieces import trajectory
 from pinn_dyn.evaluation.external_torque import (
     ExternalTorque,
@@ -40,7 +41,7 @@ def external_torque(
     chain = None if link is None else _chain(model, urdf, link)
     motions: Sequence[Trajectory] = source.load().validation
     if quiet is not None:
-        motions = [_motion(source, clean) for _, _, clean in source.recordings(quiet)]
+        motions = [motion for _, motion in log_motions(source, quiet)]
     levels = contact_thresholds(model, motions, bandwidth, false_alarms)
     threshold = pd.Series(levels, index=source.labels)
     contacts: list[dict[str, object]] = []
@@ -74,7 +75,12 @@ def external_torque(
     return ExternalTorque(table, threshold, pd.DataFrame(contacts, columns=names), bandwidth)
 
 
-def _motion(source: LogSource, clean: Any) -> Trajectory:
+def log_motions(source: LogSource, frame: pd.DataFrame) -> list[tuple[Recording, Trajectory]]:
+    """Return each run of a frame after the cleaning of a log."""
+    return [(clean, _motion(source, clean)) for _, _, clean in source.recordings(frame)]
+
+
+def _motion(source: LogSource, clean: Recording) -> Trajectory:
     return trajectory(clean, clean.sample_time("external_torque"), source.interpolation)
 
 

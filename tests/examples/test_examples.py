@@ -139,6 +139,21 @@ def test_saturated_drive():
     assert abs(float(curve) - 0.3) < 0.005 < 0.3 < float(without) - 0.3
 
 
+def test_warm_up(home):
+    """Friction falls to 62 % of 0.3 Nms/rad and 0.2 Nm."""
+    numbers = re.findall(r": \S+ -> (\S+) \(", run("warm_up.py"))
+    assert [float(x) for x in numbers[::2]] == pytest.approx([0.186, 0.124], abs=0.03)
+    assert (home / "warm_up.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
+def test_adaptive_tracking(home):
+    errors = re.findall(r"error (\S+) mrad", run("adaptive_tracking.py"))
+    assert float(errors[1]) < 2 < 50 < float(errors[0])
+    assert (home / "law.c").is_file()
+
+
 def test_randomized_robots(home):
     """The draws differ most in the mass of the first body, which the motion does not determine."""
     text = run("randomized_robots.py")
