@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from pinn_dyn.control.observer import DisturbanceObserver, rest_speeds
-from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels, save, units
+from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels, save
+from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 from pinn_dyn.systems import RigidChain
 

@@ -152,9 +152,9 @@ class LeastSquares:
         fit = partial(fit, stopped=stopped, validate=validate)
         absent = model.absent_parameters()
         if absent is None or validate is None or stopped or covariance is not None:
-            return fit(model)
+            return fit(model, keep=keep)
         simple = copy.deepcopy(model)
-        first, second = fit(simple, absent=absent), fit(model)
+        second, first = fit(model, keep=keep), fit(simple, absent=absent)
         names = [model.parameter_names()[k] for k in absent.isfinite().nonzero().flatten()]
         text = f"validation errors {first.errors.mean():.4g} without, {second.errors.mean():.4g}"
         if second.errors.mean() < first.errors.mean():
@@ -172,6 +172,7 @@ class LeastSquares:
         covariance: Tensor | None,
         stopped: Fit | None,
         validate: Callable[[LearnedConstants], Tensor] | None,
+        keep: Callable[[Fit], None] = lambda _: None,
         absent: Tensor | None = None,
     ) -> Fit:
         """Fit all constants, or hold those at the finite values ``absent``, ``(P,)``."""

@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 import torch
 
-from pinn_dyn.app.run import Run
 from pinn_dyn.ensembles import posterior_draws, sampled_models
 from pinn_dyn.models import CoulombFriction, KnownMechanics
+from pinn_dyn.run.run import Run
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import central_parameters
 from pinn_dyn.training import LeastSquares

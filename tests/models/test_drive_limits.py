@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from pinn_dyn import check
-from pinn_dyn.app.export import export
 from pinn_dyn.control import (
     ComputedTorque,
     PredictiveControl,
@@ -23,6 +22,7 @@ from pinn_dyn.evaluation.identification import constants_table
 from pinn_dyn.exports.c_file import find_compiler
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, DriveLimits, KnownMechanics, LoadDependent, Servo
+from pinn_dyn.run.export import export
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares
 from tests.support.known import known_model, statistics, unit_scales
