@@ -194,9 +194,10 @@ class DisturbanceObserver(Controller):
             hold: true for inputs that are held until the next sample, instead of lines between.
         """
         before = torch.cat([u[:1], u[:-1]]) if hold else u
-        rows = zip(*(x.split(_CHUNK) for x in (q, v, before, u)), strict=True)
-        parts = [self._recorded(*row) for row in rows]
-        momentum, ending, starting = (torch.cat(x) for x in zip(*parts, strict=True))
+        rows = zip(*(x.split(_CHUNK) for x in (q, v)), strict=True)
+        parts = [self._momentum_and_force(*row) for row in rows]
+        momentum, force = (torch.cat(x) for x in zip(*parts, strict=True))
+        ending, starting = (force + self._driven(q, v, x) for x in (before, u))
         disturbance = momentum.diff(dim=0) / period - 0.5 * (ending[1:] + starting[:-1])
         band = self._friction_band(v)
         ranges = _joined([x[1:] for x in band], [x[:-1] for x in band])
@@ -205,11 +206,6 @@ class DisturbanceObserver(Controller):
             change = self._change(value, residuals[-1], period, *friction)
             residuals.append(residuals[-1] + change)
         return torch.stack(residuals)
-
-    def _recorded(self, q: Tensor, v: Tensor, before: Tensor, after: Tensor) -> tuple[Tensor, ...]:
-        """Return M v, and f + A u with the inputs before and after the samples, ``(T, N)``."""
-        momentum, force = self._momentum_and_force(q, v)
-        return momentum, *(force + self._driven(q, v, u) for u in (before, after))
 
     def _momentum_and_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Return p = M v and f, the part of dp/dt without the input: C^T v - G - D v - F.

@@ -93,8 +93,7 @@ def adapted_constants(
         Table with the columns of :attr:`Adaptation.table` except for the run.
     """
     with_signs = Signal(motion.t, torch.cat([motion.u.double(), motion.v.double().sign()], dim=1))
-    marked = replace(motion, input=with_signs, past=None)
-    q, v, a, u = filtered_motion([marked], cutoff, 10**9)
+    q, v, a, u = filtered_motion([replace(motion, input=with_signs, past=None)], cutoff, 10**9)
     rate = 1 / float(motion.t[1] - motion.t[0])
     stride = max(round(rate / (_PER_PERIOD * cutoff)), 1)
     edge = (len(motion.t) - len(q)) / 2 / rate
@@ -125,10 +124,11 @@ def adapted_constants(
         values, deviations = _followed(
             rows[:, k], y[:, k], valid, start[k], scale[k], drift[k], noise
         )
-        units = _units(model, k, [name for name, _, _ in columns])
+        force, damping = ("Nm", "Nms/rad") if model.structure.turning[k] else ("N", "Ns/m")
         for c, (name, _, _) in enumerate(columns):
             width = 1.96 * deviations[:, c]
-            item: dict[str, Any] = {"time": times, "name": f"{name} of {joint}", "unit": units[c]}
+            unit = damping if name == "viscous friction" else force
+            item: dict[str, Any] = {"time": times, "name": f"{name} of {joint}", "unit": unit}
             item |= {"value": values[:, c], "low": values[:, c] - width}
             item |= {"high": values[:, c] + width, "start": start[k, c]}
             tables.append(pd.DataFrame(item))
@@ -168,9 +168,3 @@ def _followed(
         values.append(theta)
         deviations.append(np.sqrt(np.diag(P)))
     return np.array(values), np.array(deviations)
-
-
-def _units(model: KnownMechanics, joint: int, names: Sequence[str]) -> list[str]:
-    turns = model.structure.turning[joint]
-    force, damping = ("Nm", "Nms/rad") if turns else ("N", "Ns/m")
-    return [damping if name.startswith("viscous") else force for name in names]

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
+from scipy.signal import lfilter
 from torch import Tensor
 
 from pinn_dyn.control.observer import DisturbanceObserver, rest_speeds
@@ -56,7 +57,10 @@ class ExternalTorque:
         run = self.table["run"].iloc[0] if run is None else run
         rows = self.table[self.table["run"] == run]
         t, joints = rows["time"].to_numpy(), list(self.threshold.index)
-        names = [f"{joint.split(' [')[0]}\n[{_unit(joint)}]" for joint in joints]
+        names = [
+            f"{joint.split(' [')[0]}\n[{'N' if units([joint]) == 'm' else 'Nm'}]"
+            for joint in joints
+        ]
         title = f"{run}: external torque, observer of {self.bandwidth:g} 1/s"
         figure, (torques, external) = panels([names, names], t, title=title)
         for joint, first, second in zip(joints, torques, external, strict=True):
@@ -93,10 +97,8 @@ def observed_torques(
         residual = observer.observe(q, v, u, period, hold=motion.input.interpolation == "hold")
         drive = observer._driven(q, v, u)
     gain = -math.expm1(-bandwidth * period)
-    filtered = [drive[0]]
-    for value in drive[1:]:
-        filtered.append(filtered[-1] + gain * (value - filtered[-1]))
-    return residual, torch.stack(filtered)
+    filtered = lfilter([gain], [1, gain - 1], (drive - drive[0]).numpy(), axis=0)
+    return residual, drive[0] + torch.from_numpy(filtered)
 
 
 def contact_thresholds(
@@ -128,15 +130,13 @@ def contact_thresholds(
         size = observed_torques(model, motion, bandwidth)[0][math.ceil(start) :].abs()
         blocks += [part.amax(0) for part in size.split(length) if len(part) == length]
     if len(blocks) < _FEWEST_BLOCKS:
-        need = _FEWEST_BLOCKS * _BLOCK / bandwidth
         raise ValueError(
             f"the quiet motions have {len(blocks)} stretches of {_BLOCK / bandwidth:.2g} s, "
-            f"expected {_FEWEST_BLOCKS} for a threshold: give {need:.2g} s without a contact as "
+            f"expected {_FEWEST_BLOCKS} for a threshold: give {_FEWEST_BLOCKS * _BLOCK / bandwidth:.2g} s without a contact as "
             "quiet, or a larger bandwidth"
         )
     values = torch.stack(blocks)
-    hours = _BLOCK / bandwidth / 3600
-    share = -math.expm1(-false_alarms * hours / values.shape[1])
+    share = -math.expm1(-false_alarms * _BLOCK / (3600 * bandwidth) / values.shape[1])
     level = math.sqrt(6) / math.pi * (-math.log(-math.log1p(-share)) - np.euler_gamma)
     return (values.mean(0) + level * values.std(0)).numpy()
 
@@ -198,7 +198,3 @@ def link_wrench(
     if J.shape[-1] < size:
         ambiguous = torch.ones_like(ambiguous)
     return wrench[..., 0] * scale, ambiguous
-
-
-def _unit(label: str) -> str:
-    return "N" if units([label]) == "m" else "Nm"

@@ -57,8 +57,7 @@ def external_torque(
             for label, x in zip(source.labels, y.T.numpy(), strict=True)
         }
         contacts += contact_intervals(clean.run, clean.t, residual.numpy(), threshold, bandwidth)
-        outside = (residual.abs().numpy() > levels).any(axis=1)
-        columns["contact"] = outside
+        columns["contact"] = (residual.abs().numpy() > levels).any(axis=1)
         if chain is not None:
             wrench, ambiguous = link_wrench(chain, motion.q, residual, moment=moment)
             columns |= dict(zip(_WRENCH, wrench.T.numpy(), strict=False))

@@ -46,14 +46,12 @@ def _motive(text: str) -> str:
     if named is None:
         return text
     quantities, axes = rows[last - 1], rows[last]
-    settings = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
-    length = _LENGTHS.get(settings.get("Length Units", "").lower(), "")
+    length = next((unit for cell in rows[0] if (unit := _LENGTHS.get(cell.lower()))), "")
     names, units = axes[:2], ["", "s"]
     for name, quantity, axis in zip(named[2:], quantities[2:], axes[2:], strict=False):
-        is_position = quantity == "Position"
-        parts = [] if is_position else [quantity.lower()]
-        names.append(f"{name}:{' '.join(filter(None, [*parts, axis]))}")
-        units.append(length if is_position else "")
+        kind = "" if quantity == "Position" else quantity.lower()
+        names.append(f"{name}:{' '.join(filter(None, [kind, axis]))}")
+        units.append("" if kind else length)
     return _with_header(lines, last - 1, last + 1, names, units, ",")
 
 
