@@ -132,8 +132,9 @@ def contact_thresholds(
     if len(blocks) < _FEWEST_BLOCKS:
         raise ValueError(
             f"the quiet motions have {len(blocks)} stretches of {_BLOCK / bandwidth:.2g} s, "
-            f"expected {_FEWEST_BLOCKS} for a threshold: give {_FEWEST_BLOCKS * _BLOCK / bandwidth:.2g} s without a contact as "
-            "quiet, or a larger bandwidth"
+            f"expected {_FEWEST_BLOCKS} for a threshold: give "
+            f"{_FEWEST_BLOCKS * _BLOCK / bandwidth:.2g} s without a contact as quiet, or a larger "
+            "bandwidth"
         )
     values = torch.stack(blocks)
     share = -math.expm1(-false_alarms * _BLOCK / (3600 * bandwidth) / values.shape[1])
