@@ -25,6 +25,7 @@ from pinn_dyn.models import CoulombFriction, DriveLimits, KnownMechanics, LoadDe
 from pinn_dyn.run.export import export
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares
+from tests.models.builders import make_structured
 from tests.support.known import known_model, statistics, unit_scales
 
 MASS, LENGTH, VISCOUS, DRY = 1.0, 0.3, 0.15, 0.2
@@ -234,5 +235,7 @@ def test_the_check_of_a_log_names_a_drive_that_saturates(motions):
 def test_wrong_limits_are_refused():
     with pytest.raises(ValueError, match="stall and no_load_speed together"):
         DriveLimits(unit_scales(1), stall=3.0)
+    with pytest.raises(ValueError, match="a loss by load needs known drives"):
+        make_structured("lnn", friction=LoadDependent)
     with pytest.raises(ValueError, match=r"leave out model\.limits"):
         KnownMechanics(statistics(1), RigidChain(ARM), limits=DC, input=Servo)
