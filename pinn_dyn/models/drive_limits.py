@@ -96,8 +96,7 @@ class DriveLimits(nn.Module):
 
     def physical_constants(self) -> list[Named]:
         """Return the learned limits."""
-        parts = [self.learned[name] for name in self.learned]
-        return [part.named() for part in parts if isinstance(part, Constants)]
+        return [x.named() for x in self.learned.values() if isinstance(x, Constants)]
 
     def _value(self, name: str) -> Tensor:
         return self.learned[name]() if name in self.learned else self.get_buffer(f"fixed_{name}")

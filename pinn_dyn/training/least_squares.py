@@ -398,8 +398,7 @@ class LeastSquares:
 def _marked(model: LearnedConstants, run: Trajectory) -> Trajectory:
     """Return a motion whose inputs are followed by 1 where a drive saturates, ``(T, M + N)``."""
     with torch.no_grad():
-        saturated = model.saturated(run.v.double(), run.u.double())
-    u = torch.cat([run.u.double(), saturated.double()], dim=1)
+        u = torch.cat([run.u, model.saturated(run.v.double(), run.u.double())], dim=1).double()
     return replace(run, input=Signal(run.t, u, run.input.interpolation), past=None)
 
 
