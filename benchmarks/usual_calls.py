@@ -28,7 +28,6 @@ import torch
 from long_rollout import FINGERS, PANDA, STEP, models_of
 from torch import Tensor
 
-from pinn_dyn.run.provenance import provenance
 from pinn_dyn.envs import ModelPlant, RobotEnv, RobotVectorEnv
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports import c_loop
@@ -36,6 +35,7 @@ from pinn_dyn.exports.exported import write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Signal, Trajectory, double_copy
 from pinn_dyn.models import KnownMechanics
+from pinn_dyn.run.provenance import provenance
 from pinn_dyn.systems import MujocoArm, RigidChain
 
 HERE = Path(__file__).parent

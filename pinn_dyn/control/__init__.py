@@ -1,5 +1,6 @@
 """Control on a mechanical system, true or learned: laws, references, closed loop, stability."""
 
+from pinn_dyn.control.adaptive import AdaptiveTracking
 from pinn_dyn.control.closed_loop import close_loop
 from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
@@ -28,6 +29,7 @@ from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 
 __all__ = [
     "Actuator",
+    "AdaptiveTracking",
     "ClosedLoopRecord",
     "ComputedTorque",
     "Controller",

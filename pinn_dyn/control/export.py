@@ -61,7 +61,8 @@ def export_law(
     model, n = safe.law.model, safe.law.num_coordinates
     inputs = drawn_states({**dict.fromkeys(INPUTS, n), "memory_in": safe.memory_size}, ranges)
     begin = safe.stored_inputs
-    inputs["memory_in"][:, begin : begin + 1].round_()  # of an observer: called before or not
+    if safe.observer:
+        inputs["memory_in"][:, begin : begin + 1].round_()  # called before or not
     info = {
         "law": type(safe.law).__name__,
         "observer": safe.observer and {"bandwidth": safe.observer.bandwidth},

@@ -171,6 +171,7 @@ class ModelBasedLaw(Controller):
             u = model.typical_input(q)
             A = jacobians(lambda x: model._applied_force(q, v, x), u)[1][0]
         else:
+            tau = model._reachable_force(q, v, tau)
             solution = model.solve_input(self.solver, q, v, tau, previous, all_steps=all_steps)
             u, A = solution.u, solution.J
         if feedback is not None:

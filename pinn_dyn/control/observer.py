@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from pydantic import PositiveFloat
@@ -12,7 +13,11 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.laws import ModelBasedLaw
+from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec, pseudo_inverse_times
+from pinn_dyn.models import CoulombFriction
+
+_CHUNK = 4096  # samples whose terms are computed at once
 
 
 class DisturbanceObserver(Controller):
@@ -31,6 +36,11 @@ class DisturbanceObserver(Controller):
 
     where each entry is limited to max_rate T, and T is the time between two calls.
 
+    :meth:`estimate` and :meth:`observe` give r alone, without a law. With ``rest``, the law is that
+    of sticking rollouts (:class:`~pinn_dyn.mechanics.sliding.Sliding`): dry friction is sliding
+    friction, and anything between both directions for joints slower than ``rest`` or that reverse.
+    In d_k, it is the value in this range that brings r_k+1 closest to zero.
+
     Stability for a square A: with a = 1 - exp(-K_O T) and mu the largest eigenvalue of M_L M^-1
     (model M_L, plant M), the loop is stable for a mu < 2. An unknown dead time of n periods reduces
     this for M_L = M to a < 2 sin(pi / (4 n + 2)). Beyond, r alternates within max_rate T.
@@ -41,39 +51,49 @@ class DisturbanceObserver(Controller):
     control; Haddadin, De Luca, Albu-Schaeffer 2017, Robot collisions: a survey. Not in the paper.
 
     Args:
-        law: the law to correct; the observer uses its model and its A^+.
+        law: the law to correct; the observer uses its model and its A^+. A model alone gives an
+            observer that has no law to correct.
         bandwidth: K_O, 1/s.
         max_rate: largest rate of change of each entry of r, N/s or Nm/s; None for no limit.
         actuator: limits of the plant's input, so that r does not wind up in saturation. Give an
             object of its own, since limits of the rate have a memory. u itself is not limited.
+        rest: speed below which a joint counts as at rest, ``(N,)``, rad/s or m/s; None for none.
 
     Raises:
-        ValueError: on a model whose force is not linear in the input.
+        ValueError: on a law of a model whose force is not linear in the input.
 
     Attributes:
         residual: r of the latest call, ``(*batch, N)``, N or Nm; None before the first call.
         bandwidth, max_rate: as above; the rate is infinite without a limit.
     """
 
+    law: ModelBasedLaw
     _finish: Callable[[Tensor], Tensor]
     _u: Tensor
 
     def __init__(
         self,
-        law: ModelBasedLaw,
-        bandwidth: PositiveFloat,
+        law: ModelBasedLaw | MechanicalSystem,
+        bandwidth: PositiveFloat | Tensor,
         *,
         max_rate: PositiveFloat | None = None,
         actuator: Actuator | None = None,
+        rest: Tensor | None = None,
     ):
         super().__init__(law.num_coordinates, law.num_inputs)
-        if not law.model.input_affine:
-            raise ValueError("the observer needs a force A(q) u: remove controllers.<law>.observer")
-        self.law = law
-        self.bandwidth = float(bandwidth)
+        if isinstance(law, MechanicalSystem):
+            self.model = law
+        else:
+            self.law, self.model = law, law.model
+            if not law.model.input_affine:
+                raise ValueError(
+                    "the observer needs a force A(q) u: remove controllers.<law>.observer"
+                )
+        self.bandwidth = bandwidth
+        self.rest = rest
         self.max_rate = math.inf if max_rate is None else float(max_rate)
         self._actuator = actuator
-        self.memory_size = 1 + 3 * law.num_coordinates
+        self.memory_size = 1 + (3 if rest is None else 5) * law.num_coordinates
         self._forget()
 
     def reset(self) -> None:
@@ -129,25 +149,102 @@ class DisturbanceObserver(Controller):
         Returns:
             u - A^+ r, and a function from the applied input to the memory for the next call.
         """
-        model, n = self.law.model, q.shape[-1]
-        started, residual, last_momentum, last_force = memory.split([1, n, n, n], dim=-1)
-        momentum, A = model.momentum(q, v), model.input_matrix(q)
-        # The part of dp/dt without the input: C^T v - G - D v.
-        state = torch.cat([q, momentum], dim=-1)
-        force = model.momentum_derivative(state, torch.zeros_like(u))[..., n:]
-        modeled = last_force + 0.5 * (force + matvec(A, last))
+        A = self.model.input_matrix(q)
+        residual, finish = self.estimate(q, v, last, memory, period, A)
+        return u - pseudo_inverse_times(A, residual), finish
+
+    def estimate(
+        self,
+        q: Tensor,
+        v: Tensor,
+        last: Tensor,
+        memory: Tensor,
+        period: float | Tensor,
+        A: Tensor | None = None,
+    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Return r and a function from the applied input to the memory for the next call.
+
+        Arguments as for :meth:`correct`. A ``(*batch, N, M)`` saves its computation.
+        """
+        n = q.shape[-1]
+        sizes = [1] + [n] * (self.memory_size // n)
+        started, residual, last_momentum, last_force, *last_band = memory.split(sizes, dim=-1)
+        momentum, force = self._momentum_and_force(q, v)
+        modeled = last_force + 0.5 * (force + self._driven(q, v, last, A))
         disturbance = (momentum - last_momentum) / period - modeled
-        change = -math.expm1(-self.bandwidth * period) * (disturbance - residual)
-        limit = self.max_rate * period
-        if math.isfinite(limit):
-            change = change.clamp(-limit, limit)
+        band = self._friction_band(v)
+        change = self._change(disturbance, residual, period, *_joined(band, last_band))
         residual = residual + started * change
 
         def finish(applied: Tensor) -> Tensor:
-            half = 0.5 * (force + matvec(A, applied))
-            return torch.cat([torch.ones_like(started), residual, momentum, half], dim=-1)
+            half = 0.5 * (force + self._driven(q, v, applied, A))
+            return torch.cat([torch.ones_like(started), residual, momentum, half, *band], dim=-1)
 
-        return u - pseudo_inverse_times(A, residual), finish
+        return residual, finish
+
+    def observe(
+        self, q: Tensor, v: Tensor, u: Tensor, period: float, *, hold: bool = False
+    ) -> Tensor:
+        """Return r at all samples of a motion, ``(T, N)``.
+
+        Args:
+            q, v: states at the times k T, ``(T, N)``.
+            u: inputs at these times, ``(T, M)``.
+            period: T, s.
+            hold: true for inputs that are held until the next sample, instead of lines between.
+        """
+        before = torch.cat([u[:1], u[:-1]]) if hold else u
+        rows = zip(*(x.split(_CHUNK) for x in (q, v)), strict=True)
+        parts = [self._momentum_and_force(*row) for row in rows]
+        momentum, force = (torch.cat(x) for x in zip(*parts, strict=True))
+        ending, starting = (force + self._driven(q, v, x) for x in (before, u))
+        disturbance = momentum.diff(dim=0) / period - 0.5 * (ending[1:] + starting[:-1])
+        band = self._friction_band(v)
+        ranges = _joined([x[1:] for x in band], [x[:-1] for x in band])
+        residuals = [torch.zeros_like(q[0])]
+        for value, *friction in zip(disturbance, *ranges, strict=True):
+            change = self._change(value, residuals[-1], period, *friction)
+            residuals.append(residuals[-1] + change)
+        return torch.stack(residuals)
+
+    def _momentum_and_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return p = M v and f, the part of dp/dt without the input: C^T v - G - D v - F.
+
+        With ``rest``, f is without the dry friction F.
+        """
+        momentum = self.model.momentum(q, v)
+        state = torch.cat([q, momentum], dim=-1)
+        no_input = q.new_zeros(*q.shape[:-1], self.num_inputs)
+        force = self.model.momentum_derivative(state, no_input)[..., q.shape[-1] :]
+        return momentum, force if self.rest is None else force + self.model._friction_force(v)
+
+    def _driven(self, q: Tensor, v: Tensor, u: Tensor, A: Tensor | None = None) -> Tensor:
+        """Return the force that the input adds, ``(*batch, N)``."""
+        if A is not None:
+            return matvec(A, u)
+        no_input = self.model._applied_force(q, v, torch.zeros_like(u))
+        return self.model._applied_force(q, v, u) - no_input
+
+    def _friction_band(self, v: Tensor) -> list[Tensor]:
+        """Return the least and the largest dry friction at v, ``(*batch, N)``; [] without rest."""
+        if self.rest is None:
+            return []
+        forward, resting = (v > 0).to(v), v.abs() < self.rest
+        shares = (torch.where(resting, end, forward) for end in (0.0, 1.0))
+        return [self.model._sliding_force(v, share) for share in shares]
+
+    def _change(
+        self, disturbance: Tensor, residual: Tensor, period: float | Tensor, *friction: Tensor
+    ) -> Tensor:
+        """Return r_k+1 - r_k, with the least and largest friction that d does not contain yet."""
+        exponent = -self.bandwidth * period
+        gain = -(exponent.expm1() if isinstance(exponent, Tensor) else math.expm1(exponent))
+        if friction:
+            holding = residual - residual / gain - disturbance  # r_k+1 would be zero
+            disturbance = disturbance + torch.clamp(holding, *friction)
+        change = gain * (disturbance - residual)
+        limit: Any = self.max_rate * period
+        return change.clamp(-limit, limit) if math.isfinite(self.max_rate) else change
 
     def replace_input(self, u: Tensor) -> None:
         """Set the input that acts in place of that of the latest call, ``(*batch, M)``."""
@@ -161,3 +258,19 @@ class DisturbanceObserver(Controller):
 
     def faults(self) -> dict[str, Tensor]:
         return self.law.faults()
+
+
+def _joined(band: list[Tensor], last_band: list[Tensor]) -> tuple[Tensor, ...]:
+    """Return the least and the largest friction between two instants; () without bands."""
+    if not band:
+        return ()
+    return torch.minimum(band[0], last_band[0]), torch.maximum(band[1], last_band[1])
+
+
+def rest_speeds(model: MechanicalSystem) -> Tensor | None:
+    """Return the speeds ``(N,)`` below which joints of a model with stiction count as at rest.
+
+    These are the widths of its Coulomb law. None for a model whose joints do not stick.
+    """
+    laws = [x for x in model.modules() if isinstance(x, CoulombFriction) and x.sticking]
+    return torch.stack([law.width().detach() for law in laws]).amax(0) if laws else None

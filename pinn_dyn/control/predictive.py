@@ -58,7 +58,8 @@ class PredictiveControl(Controller):
         input_weight, rate_weight: R of u - u_ref and S of du/dt, one number or M.
         terminal_weight: P in multiples of Q; None for P of the linear-quadratic regulator at the
             end of the reference.
-        actuator: hard limits of the input and of its rate.
+        actuator: hard limits of the input and of its rate. Limits of the drives in the model are
+            limits, too.
         q_low, q_high, v_max: soft limits of the state, one number or N; None for no limit.
         iterations: quadratic programs per instant; the first instant may take 20 times as many.
         observer_bandwidth: K_O in 1/s of an observer of the acceleration d that the model does not
@@ -97,6 +98,8 @@ class PredictiveControl(Controller):
         if steps < 2:
             raise ValueError(f"horizon is {horizon} s, expected two steps of {step} s or more")
         actuator = actuator or Actuator()
+        largest = model.largest_input()
+        most = np.full(m, np.inf) if largest is None else largest.detach().numpy()
         x_weight = [
             _row("position_weight", position_weight, n),
             _row("velocity_weight", velocity_weight, n),
@@ -109,8 +112,8 @@ class PredictiveControl(Controller):
         self.limits = Limits(
             np.concatenate([low, -v_high]),
             np.concatenate([high, v_high]),
-            _row("actuator.low", actuator.low, m, -np.inf),
-            _row("actuator.high", actuator.high, m, np.inf),
+            np.maximum(_row("actuator.low", actuator.low, m, -np.inf), -most),
+            np.minimum(_row("actuator.high", actuator.high, m, np.inf), most),
             _row("actuator.rate", actuator.rate, m, np.inf),
         )
         self.weights = Weights(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pinn_dyn.control.adaptive import AdaptiveTracking
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.dead_time import DelayCompensation
 from pinn_dyn.control.effects import Actuator
@@ -23,7 +24,8 @@ class SafeLaw:
 
     1. The law and its observer give u.
     2. Outside the training data (a :class:`Guarded` law), the fall-back of the guard replaces u.
-    3. If u is not finite, the last u replaces it. The observer keeps its memory while v is not.
+    3. If u is not finite, the last u replaces it. The observer keeps its memory while v is not, and
+       so does an :class:`AdaptiveTracking`.
     4. The actuator limits u.
 
     A :class:`DelayCompensation` predicts q and v first; references are those at the end of the dead
@@ -31,7 +33,7 @@ class SafeLaw:
 
     The status is the sum of 1 (the actuator changed u), 2 (outside the training data) and 4 (not
     finite). The memory is zero before the first call. It holds the last u ``(M,)`` and the memory
-    of the observer, see :meth:`DisturbanceObserver.correct`.
+    of the observer, see :meth:`DisturbanceObserver.correct`, or of the adaptation.
 
     Args:
         controller: a law of a model, also with an observer, a guard or a DelayCompensation.
@@ -70,6 +72,14 @@ class SafeLaw:
         self.memory_size = self.stored_inputs
         if self.observer:
             self.memory_size += self.observer.memory_size
+        self.adaptive = law if isinstance(law, AdaptiveTracking) else None
+        if self.adaptive:
+            if self.observer or self.compensation or period is None:
+                raise ValueError(
+                    "AdaptiveTracking is exported with a fixed period, without an observer and "
+                    "without a dead time"
+                )
+            self.memory_size += self.adaptive.memory_size
 
     def __call__(
         self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor, memory_in: Tensor
@@ -81,7 +91,11 @@ class SafeLaw:
         last = past[-1]
         if self.compensation:
             q, v = self.compensation.predict(q, v, past)
-        u = self.law.law(q, v, *reference, last)
+        if self.adaptive:
+            u = self.adaptive.law_of(q, v, reference, memory)
+            changes = self.adaptive.changes(q, v, reference, memory)
+        else:
+            u = self.law.law(q, v, *reference, last)
         if self.observer:
             u, finish = self.observer.correct(q, v, u, last, memory, self.period or 0.0)
         status = torch.zeros_like(q[0])
@@ -94,8 +108,11 @@ class SafeLaw:
         u = torch.where(finite, u, last)
         applied = self.actuator.limit(u, last, self.period or 0.0)
         status = status + LIMITED * ((applied != u).to(u).sum() > 0)
-        if self.observer:
-            after = finish(applied)
+        if self.observer or self.adaptive:
+            if self.adaptive:
+                after = self.adaptive.adapted(memory, changes, self.period or 0.0)
+            else:
+                after = finish(applied)
             memory = torch.where(finite & (after.abs().sum() < torch.inf), after, memory)
         output, stored = applied, applied
         if self.compensation:

@@ -106,12 +106,16 @@ class _LoadedRobot(nn.Module):
 
     has_passive_joints = False  # the equation of a load has no mass matrix
     parameter_names = LearnedConstants.parameter_names
+    absent_parameters = LearnedConstants.absent_parameters
 
     def physical_constants(self) -> list[Named]:
         return [*self.known.physical_constants(), self.load.named()]
 
     def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         return self.known.force_scale(q, v, a, u[:, :-1])
+
+    def saturated(self, v: Tensor, u: Tensor) -> Tensor:
+        return self.known.saturated(v, u[:, :-1])
 
     def slopes(self) -> _LoadedRobot:
         return self

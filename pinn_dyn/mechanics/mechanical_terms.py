@@ -77,6 +77,10 @@ class MechanicalTerms(ContinuousPredictor):
         """Return stiff terms K(q) of dG/dq, ``(*batch, N, N)``, or None, for implicit methods."""
         return None
 
+    def largest_input(self) -> Tensor | None:
+        """Return the inputs beyond which the drives give no more force, ``(M,)``, or None."""
+        return None
+
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return matvec(self.input_matrix(q), u)
 
@@ -86,6 +90,10 @@ class MechanicalTerms(ContinuousPredictor):
     def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         force = self._input_force(q, u)
         return force + self._residual_force(q, v, u) if self.has_residual else force
+
+    def _reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
+        """Return the force closest to tau that an input gives, ``(*batch, N)``."""
+        return tau
 
     def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         """Return dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v, and dH/dp = M^-1 p = v."""

@@ -7,11 +7,13 @@ from pinn_dyn.models.cholesky import (
     FixedCholesky,
     NetworkCholesky,
 )
+from pinn_dyn.models.drive_limits import DriveLimits
 from pinn_dyn.models.elastic import ElasticJoints
 from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
     CoulombFriction,
     Friction,
+    LoadDependent,
     NoFriction,
     Stribeck,
 )
@@ -52,6 +54,7 @@ __all__ = [
     "ConstantInput",
     "CoulombFriction",
     "CoupledOscillators",
+    "DriveLimits",
     "ElasticJoints",
     "FixedCholesky",
     "FixedInput",
@@ -64,6 +67,7 @@ __all__ = [
     "LagrangianNetwork",
     "LearnedConstants",
     "LearnedVelocity",
+    "LoadDependent",
     "Modes",
     "NetworkCholesky",
     "NetworkInput",

@@ -18,10 +18,12 @@ _SMALLEST_WIDTH = 0.01
 class Friction(nn.Module, abc.ABC):
     """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0.
 
-    With ``sticking``, rollouts use :meth:`sliding` instead of F.
+    With ``sticking``, rollouts use :meth:`sliding` instead of F. With ``by_load``, a part of the
+    force of the drives is lost, see :meth:`transmitted`.
     """
 
     sticking: bool = False
+    by_load: bool = False
 
     @abc.abstractmethod
     def forward(self, v: Tensor) -> Tensor:
@@ -37,6 +39,10 @@ class Friction(nn.Module, abc.ABC):
         The default is F(v), without a jump at v = 0.
         """
         return self(v)
+
+    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
+        """Return the joint force after transmission losses, ``(*batch, N)``. By default none."""
+        return force
 
     def physical_constants(self) -> list[Named]:
         """Return the learned constants in physical units. The default has none."""
@@ -177,3 +183,33 @@ class Stribeck(AsymmetricCoulomb):
 
     def _rise(self, v: Tensor) -> Tensor:
         return self.rise() * torch.exp(-((v / self.speed()) ** 2))
+
+
+class LoadDependent(AsymmetricCoulomb):
+    """Coulomb law by direction, and a loss that grows with the force f_i of the drive::
+
+        transmitted_i = f_i - l_i |f_i| tanh(v_i / w_i),      0 < l_i < 1
+
+    So the friction of a moving joint is c_i + l_i |f_i|. At rest only c_i holds the joint. Source:
+    model M3 of Duclusaud et al. (2025), "Extended friction models for the physics simulation of
+    servo actuators", with the force of the drive as the load.
+    """
+
+    by_load = True
+
+    def _add_constants(self, scales: Scales) -> None:
+        super()._add_constants(scales)
+        ones = torch.ones(scales.size, dtype=scales.value.dtype)
+        self.odds = scales.positive("loss by load", 0.05, ones, 1.0, ["1"] * scales.size)
+
+    def physical_constants(self) -> list[Named]:
+        loss = self.odds.named()._replace(values=self._loss())
+        return [*super().physical_constants(), loss]
+
+    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
+        return force - self._loss() * force.abs() * torch.tanh(v / self.width())
+
+    def _loss(self) -> Tensor:
+        """Return l, ``(N,)``."""
+        odds = self.odds()
+        return odds / (1 + odds)

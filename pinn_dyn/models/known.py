@@ -13,8 +13,9 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.integrators import with_friction
+from pinn_dyn.models.drive_limits import DriveLimits
 from pinn_dyn.models.elastic import ElasticJoints, Springs
-from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.friction import LoadDependent, NoFriction
 from pinn_dyn.models.joint_springs import JointSprings
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
@@ -28,6 +29,7 @@ from pinn_dyn.models.structured import FrictionHead
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the ten inertial parameters of a body."""
 _GENERIC_SPREAD = 3.0
+_NO_LOSS = -8.0  # z of a loss by load that is all but zero
 
 
 class KnownMechanics(LearnedConstants):
@@ -47,7 +49,8 @@ class KnownMechanics(LearnedConstants):
 
     With servos (:class:`Servo`) the inputs are targets, and A u is the force of the servos. k is
     their stiffness, and D contains their damping. With :class:`ElasticJoints` the coordinates are
-    link and motor angles, and the inputs drive the motors.
+    link and motor angles, and the inputs drive the motors. With :class:`DriveLimits` or
+    :class:`LoadDependent` friction, the drives limit k u or lose a part of it.
 
     Args:
         statistics: scales of the data.
@@ -67,10 +70,11 @@ class KnownMechanics(LearnedConstants):
             default is all joints, the motors of elastic joints, or none if the data have no inputs.
         input: builder of the servos, if the inputs are targets; k is then ``input.stiffness``.
         springs: names of the joints with a linear spring to their parent (:class:`JointSprings`).
+        limits: builder of the limits of the drives, if k u is a command that they may not reach.
 
     Raises:
         ValueError: if the structure has no rigid bodies or other joints than the data or the
-            springs, or ``spread`` names other bodies.
+            springs, ``spread`` names other bodies, or servos have limits or losses besides.
     """
 
     def __init__(
@@ -86,6 +90,7 @@ class KnownMechanics(LearnedConstants):
         driven_joints: Sequence[str] | None = None,
         input: Callable[..., Servo] | None = None,
         springs: Sequence[str] = (),
+        limits: Callable[..., DriveLimits] | None = None,
     ):
         if not isinstance(structure, Structure):
             raise ValueError(
@@ -148,6 +153,11 @@ class KnownMechanics(LearnedConstants):
         index = [names.index(name) for name in springs]
         self.springs = JointSprings(scales, index) if springs else None
         self.friction = friction(scales)
+        self.limits = limits and limits(replace(motors, value=force[self.driven]))
+        if self.limits or self.friction.by_load:
+            if self.servo is not None:
+                raise ValueError("servos have their own model.input.limit: leave out model.limits")
+            self.input_affine = False
         self.sticking = self.friction.sticking
         self.integrator = with_friction(integrator, self.sticking)
         self.elastic = Springs(elastic) if elastic else None
@@ -216,7 +226,7 @@ class KnownMechanics(LearnedConstants):
             drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
         drives += self.friction.physical_constants()
         drives += [] if self.gain is None else [self.gain.named()]
-        for part in (self.servo, self.springs):
+        for part in (self.servo, self.springs, self.limits):
             drives += [] if part is None else part.physical_constants()
         return constants + drives
 
@@ -225,9 +235,36 @@ class KnownMechanics(LearnedConstants):
         return self.structure.parameters_of(self.bodies())
 
     def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return k u, or the force of the servos, ``(*batch, N)``."""
-        force = self.input_gain() * u if self.servo is None else self.servo.torque(q, v, u)
-        return force @ self.motors
+        """Return k u behind limits and losses, or the force of the servos, ``(*batch, N)``."""
+        if self.servo is not None:
+            return self.servo.torque(q, v, u) @ self.motors
+        force = self.input_gain() * u
+        if self.limits is not None:
+            force = self.limits(force, v @ self.motors.mT)
+        return self.friction.transmitted(v, force @ self.motors)
+
+    @property
+    def identified_by_forces(self) -> bool:
+        if self.limits is not None and self.limits.learned:  # zero limits and bodies would fit
+            return False
+        return self.servo is None or self.servo.affine
+
+    def largest_input(self) -> Tensor | None:
+        return None if self.limits is None else self.limits.at_rest() / self.input_gain()
+
+    def absent_parameters(self) -> Tensor | None:
+        if not isinstance(self.friction, LoadDependent):
+            return None
+        odds = self.friction.odds.z
+        absent = [_NO_LOSS if x is odds else torch.nan for x in self.parameters()]
+        values = zip(self.parameters(), absent, strict=True)
+        return torch.cat([torch.full_like(x, value).flatten() for x, value in values]).detach()
+
+    def saturated(self, v: Tensor, u: Tensor) -> Tensor:
+        if self.limits is None:
+            return super().saturated(v, u)
+        limited = self.limits.saturated(self.input_gain() * u, v @ self.motors.mT)
+        return (limited.to(v) @ self.motors) > 0
 
     def drive_force(
         self, q: Tensor, v: Tensor, a: Tensor, u: Tensor, share: Tensor | None = None
@@ -287,11 +324,26 @@ class KnownMechanics(LearnedConstants):
         return super().typical_input(q) if self.servo is None else self.servo.typical_input(q)
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
-        return self.motor_force(q, q, u) if self.servo is None else self.servo.force(q, u)
+        if self.servo is not None:
+            return self.servo.force(q, u)
+        return (self.input_gain() * u) @ self.motors
 
     def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        force = self._input_force(q, u)
-        return force if self.input_affine or not self.servo else force + self.servo.excess(q, v, u)
+        if self.input_affine:
+            return self._input_force(q, u)
+        if self.servo is None:
+            return self.motor_force(q, v, u)
+        return self._input_force(q, u) + self.servo.excess(q, v, u)
+
+    def _reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
+        if self.limits is None:
+            return tau
+        far, speed = torch.full_like(tau @ self.motors.mT, torch.inf), v @ self.motors.mT
+        least, most = (
+            self.friction.transmitted(v, self.limits.reachable(x, speed) @ self.motors)
+            for x in (-far, far)
+        )
+        return tau.clamp(least, most)
 
     def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
         springs = [torch.diag(x.springs()) for x in (self.servo, self.springs) if x is not None]

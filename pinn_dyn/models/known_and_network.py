@@ -89,5 +89,11 @@ class KnownAndNetwork(Sum):
         force = super()._applied_force(q, v, u)
         return force if self.residual is None else force + self.residual(q, v, u)
 
+    def largest_input(self) -> Tensor | None:
+        return self.known.largest_input()
+
+    def _reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
+        return self.known._reachable_force(q, v, tau)
+
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         return v.new_zeros(v.shape) if self.residual is None else self.residual(q, v, u)

@@ -176,7 +176,11 @@ class PhysicalBodies(Constants):
 
     def forward(self) -> Tensor:
         """Return J, ``(n, 4, 4)``, or ``(*batch, n, 4, 4)`` for z ``(*batch, n, 10)``."""
-        a, d1, d2, d3, s12, s13, s23, t1, t2, t3 = (self.spread * self.z).unbind(-1)
+        return self.inertia_of(self.z)
+
+    def inertia_of(self, z: Tensor) -> Tensor:
+        """Return J of other parameters z, as :meth:`forward`."""
+        a, d1, d2, d3, s12, s13, s23, t1, t2, t3 = (self.spread * z).unbind(-1)
         zero, unit = torch.zeros_like(a), torch.ones_like(a)
         rows = [
             [torch.exp(d1), s12, s13, t1],
@@ -187,6 +191,18 @@ class PhysicalBodies(Constants):
         stretch = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
         root = torch.exp(a)[..., None, None] * (self.root @ stretch)
         return root @ root.mT
+
+    def parameters_of(self, inertia: Tensor) -> Tensor:
+        """Return the z of pseudo-inertias of positive density, ``(*batch, n, 10)``."""
+        whitened = torch.linalg.solve(self.root, torch.linalg.solve(self.root, inertia).mT)
+        # An upper Cholesky factor is a lower one of the matrix with its rows and columns reversed.
+        stretch = torch.linalg.cholesky(whitened.flip(-2, -1)).flip(-2, -1)
+        scale = stretch[..., 3, 3]
+        unit = stretch / scale[..., None, None]
+        sizes = unit.diagonal(dim1=-2, dim2=-1)[..., :3].log()
+        shears = unit[..., [0, 0, 1, 0, 1, 2], [1, 2, 2, 3, 3, 3]]
+        values = torch.cat([scale.log()[..., None], sizes, shears], dim=-1)
+        return values / self.spread
 
 
 def _add_spread(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:

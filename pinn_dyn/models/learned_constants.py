@@ -30,6 +30,19 @@ class LearnedConstants(MechanicalSystem):
         """True if coordinates have no input, so that no bodies explain their equation."""
         return self.num_inputs < self.num_coordinates
 
+    @property
+    def identified_by_forces(self) -> bool:
+        """True if the force of a filtered input is that of the input, filtered."""
+        return self.input_affine
+
+    def saturated(self, v: Tensor, u: Tensor) -> Tensor:
+        """Return where drives do not reach the force of their command, ``(*batch, N)``, bool."""
+        return torch.zeros_like(v, dtype=torch.bool)
+
+    def absent_parameters(self) -> Tensor | None:
+        """Return z ``(P,)`` at which an optional effect is absent, NaN for all other parameters."""
+        return None
+
     def parameter_names(self) -> list[str]:
         """Return the meaning of each parameter, or the name of its attribute."""
         names: list[str] = []

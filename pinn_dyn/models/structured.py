@@ -63,6 +63,8 @@ class StructuredNetwork(MechanicalSystem):
         self.potential = potential(self._scales(statistics, energy))
         self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
         self.friction = friction(self._scales(statistics, force))
+        if self.friction.by_load:
+            raise ValueError("a loss by load needs known drives: use model=known")
         self.sticking = self.friction.sticking
         if self.sticking and state == "qp":
             raise ValueError(

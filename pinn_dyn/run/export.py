@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 
 from pinn_dyn import __version__
+from pinn_dyn.control.external_torque import NAME, external_torque_function
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.exports.exported import ENDINGS, Ranges, Real, write
 from pinn_dyn.exports.model_functions import model_functions
-from pinn_dyn.mechanics import Predictor, double_copy
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
 from pinn_dyn.models.subspace_encoder import EncodedPredictor
 from pinn_dyn.systems import HasDomain, RigidChain
@@ -44,7 +46,8 @@ def export(
         model: a model or a known system.
         path: the file.
         what: name of the function. The default is all functions in a ``.c`` file, otherwise
-            ``forward_dynamics``, or ``next_state`` of a model without it.
+            ``forward_dynamics``, or ``next_state`` of a model without it. ``external_torque`` is
+            the function of :func:`~.control.external_torque.external_torque_function`.
         real: type of the numbers in a ``.c`` or ``.onnx`` file.
         statistics: of the training data. The file is compared with the model in their ranges, or
             within [-1, 1] and the domain of the equation of motion.
@@ -64,7 +67,10 @@ def export(
         raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
     model = double_copy(model).requires_grad_(False)
     ranges = _within_domain(model) if statistics is None else ranges_of(statistics)
-    functions = model_functions(model, ranges)
+    if what == NAME and isinstance(model, MechanicalSystem):
+        functions = [external_torque_function(model, ranges)]
+    else:
+        functions = model_functions(model, ranges)
     names = [function.name for function in functions]
     if what is None and path.suffix != ".c":
         what = names[0]
@@ -79,6 +85,29 @@ def export(
     if isinstance(model, EncodedPredictor):
         info["memory_size"] = model.memory_size
     return write([f for f in functions if what in (None, f.name)], path, info, real)
+
+
+def export_samples(models: Sequence[Predictor], path: str | Path) -> Path:
+    """Write a URDF or MJCF of each model, and a table of their constants; return its path.
+
+    Raises:
+        ValueError: on another ending.
+        TypeError: as :func:`export`.
+    """
+    path = Path(path).expanduser()
+    if path.suffix not in _WRITERS:
+        raise ValueError(f"{path} ends in {path.suffix!r}: samples are .urdf or .xml files")
+    digits, rows = len(str(len(models) - 1)), []
+    for k, model in enumerate(models):
+        file = export(model, path.with_stem(f"{path.stem}_{k:0{max(digits, 2)}}"))
+        row: dict[str, Any] = {"file": file.name}
+        for part in getattr(model, "physical_constants", list)():
+            for name, unit, value in zip(part.names, part.units, part.values, strict=True):
+                row[f"{name} [{unit}]"] = float(value)
+        rows.append(row)
+    table = path.with_name(f"{path.stem}_samples.csv")
+    write_whole(table, pd.DataFrame(rows).to_csv(index=False))
+    return table
 
 
 def ranges_of(statistics: Statistics) -> Ranges:
@@ -131,6 +160,8 @@ def _export_robot(model: Predictor, path: Path) -> Path:
         limit = torch.full_like(offset, torch.inf)
         if servo and not servo.affine:
             limit[model.driven] = servo.largest_force()
+        if model.limits is not None:
+            limit[model.driven] = model.limits.at_rest()
         springs, damping = (servo.springs(), servo.damping_rates()) if servo else 2 * [0 * offset]
         drives = model.physical_constants()[_BODY_COLUMNS:]
         fast = torch.full_like(model.viscous(), torch.inf)

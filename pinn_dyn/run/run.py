@@ -19,8 +19,10 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
-from pinn_dyn.ensembles import Ensemble, posterior_draws
+from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
+from pinn_dyn.evaluation.adaptation import Adaptation, Constant, adapted_constants
 from pinn_dyn.evaluation.calibration import half_widths
+from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.evaluation.payload import identify_payload
 from pinn_dyn.evaluation.prediction import model_for_rollouts
@@ -36,7 +38,8 @@ from pinn_dyn.mechanics import (
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
 from pinn_dyn.run.build import build_source
-from pinn_dyn.run.export import export
+from pinn_dyn.run.export import export, export_samples
+from pinn_dyn.run.external_torque import external_torque, log_motions
 from pinn_dyn.run.predict_frame import predict_frame
 
 TRAJECTORIES = "trajectories.pt"
@@ -159,14 +162,51 @@ class Run:
         if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
             store(self._made_in_python, target / TRAJECTORIES)
 
-    def export(self, path: str | Path, what: str | None = None, *, real: Real = "double") -> Path:
+    def sample(self, n: int, seed: int = 0) -> list[Predictor]:
+        """Draw robots from the posterior of the constants that least squares fitted.
+
+        Directions that the data do not determine vary within the prior, and every body is
+        physically possible, see :func:`~pinn_dyn.ensembles.sampled_models`.
+
+        Args:
+            n: number of robots.
+            seed: seed of the draws.
+
+        Returns:
+            n models of the class of ``model``, in float64 and without gradients. All methods of a
+            model work on each, and environments for reinforcement learning take one per copy.
+
+        Raises:
+            TypeError: if the run has no covariance of constants.
+        """
+        if self.covariance is None:
+            raise TypeError("the run has no posterior: fit its constants by least squares")
+        return sampled_models(self.model, self.covariance, n, seed)
+
+    def export(
+        self,
+        path: str | Path,
+        what: str | None = None,
+        *,
+        real: Real = "double",
+        samples: int = 0,
+        seed: int = 0,
+    ) -> Path:
         """Write the model to a C, ONNX, CasADi, URDF or MJCF file, see :func:`~.run.export.export`.
 
         Args:
             path: the file; its ending selects the format.
             what: name of a function to write.
             real: type of the numbers in a ``.c`` or ``.onnx`` file, ``double`` or ``float``.
+            samples: number of draws of :meth:`sample` to write instead, as ``arm_00.xml`` and so
+                on for the path ``arm.xml``, with their constants in ``arm_samples.csv``.
+            seed: seed of the draws.
+
+        Returns:
+            The path, or that of the table of the samples.
         """
+        if samples:
+            return export_samples(self.sample(samples, seed), path)
         about = {"q": self.labels, "u": self.input_labels, "delay": self.input_delay.tolist()}
         statistics = self.statistics
         return export(self.model, path, what, real=real, statistics=statistics, about=about)
@@ -198,6 +238,93 @@ class Run:
         splits = loaded.load()
         runs = [*splits.train, *splits.validation, *splits.test]
         return identify_payload(self.model, self.source.load().train, runs, cutoff=cutoff)
+
+    def external_torque(
+        self,
+        frame: pd.DataFrame,
+        *,
+        bandwidth: float = 20.0,
+        false_alarms: float = 1.0,
+        quiet: pd.DataFrame | None = None,
+        link: str | None = None,
+        urdf: str | None = None,
+        moment: bool = False,
+    ) -> ExternalTorque:
+        """Find torques that neither drives nor model explain, and contacts, along a data frame.
+
+        The momentum observer (:class:`~pinn_dyn.control.DisturbanceObserver`) gives the external
+        torque of each joint through a low-pass of 1 / bandwidth s: after this time it has reached
+        63 %, and after three times 95 % of a step. Joints at rest show only what their dry friction
+        cannot hold. The frame has the columns and units of the log, and is cleaned by the same
+        steps.
+
+        Args:
+            frame: the log.
+            bandwidth: K_O, 1/s.
+            false_alarms: expected false alarms per hour, which sets the thresholds.
+            quiet: motion without a contact for the thresholds; None for the validation data.
+            link: link at which a force acts, for its wrench; see
+                :func:`~.evaluation.external_torque.link_wrench`.
+            urdf: robot of the link, for models without a structure.
+            moment: false for a force at the origin of the link, true for force and moment.
+
+        Raises:
+            TypeError: on a black box or an ensemble.
+            ValueError: without the columns of a log, a robot of the link, or enough quiet motion.
+        """
+        if self.log is None:
+            raise ValueError("the training data have no columns of a log")
+        return external_torque(
+            self.system,
+            self.log,
+            frame,
+            quiet=quiet,
+            bandwidth=bandwidth,
+            false_alarms=false_alarms,
+            link=link,
+            urdf=urdf,
+            moment=moment,
+        )
+
+    def adapt(
+        self,
+        frame: pd.DataFrame,
+        *,
+        time_constant: float = 60.0,
+        constants: Sequence[Constant] = ("friction",),
+    ) -> Adaptation:
+        """Follow friction and offsets of the drives over the time of a log, such as a warm-up.
+
+        All other constants are those of the run, see
+        :func:`~.evaluation.adaptation.adapted_constants`. The frame has the columns and units of
+        the log, and is cleaned by the same steps.
+
+        Args:
+            frame: the log.
+            time_constant: time in which friction may change by a half, s.
+            constants: constants to follow, ``"friction"`` and ``"offset"``.
+
+        Raises:
+            TypeError: if the model has no drives.
+            ValueError: without the columns of a log, or if the log is too short for the filter.
+        """
+        if not isinstance(self.model, KnownMechanics) or self.log is None:
+            kind = type(self.model).__name__
+            raise TypeError(f"a {kind} has no friction to follow: use a run of model=known on logs")
+        cutoff = self.config["optimizer"].get("cutoff", 6.0)
+        tables = []
+        for clean, motion in log_motions(self.log, frame):
+            table = adapted_constants(
+                self.model,
+                motion,
+                cutoff=cutoff,
+                time_constant=time_constant,
+                constants=constants,
+            )
+            table["time"] += clean.t[0] - float(motion.t[0])
+            table.insert(0, "run", clean.run)
+            tables.append(table)
+        return Adaptation(pd.concat(tables, ignore_index=True))
 
     @overload
     def predict(self, start: pd.DataFrame, *, threads: PositiveInt = 1) -> pd.DataFrame: ...

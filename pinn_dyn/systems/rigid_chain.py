@@ -362,6 +362,19 @@ class RigidChain(MechanicalSystem):
             return origin[:3].expand(*q.shape[:-1], 3)
         return self.kinematics(q).poses[..., self._tip_body, :3, :] @ origin
 
+    def tip_jacobian(self, q: Tensor) -> Tensor:
+        """Return J, ``(*batch, 6, N)``: velocity and angular velocity of the tip's frame per v.
+
+        The velocity is that of the frame's origin; both are in the frame of the base.
+        """
+        point = torch.nn.functional.pad(self.tip_position(q), (0, 1), value=1.0)
+        reached = self._moved[:, self._tip_body] if self._tip_body >= 0 else 0 * self._moved[:, 0]
+        twists = self.kinematics(q).twists * reached[:, None, None]
+        linear = matvec(twists, point.unsqueeze(-2))[..., :3]
+        angular = twists[..., [2, 0, 1], [1, 2, 0]]
+        jacobian = torch.cat([linear, angular], dim=-1).mT
+        return jacobian @ self._coupling if self._coupled else jacobian
+
     def lines(self, q: Tensor) -> Tensor:
         """Return a line from each joint to the next, and to the tip, ``(*batch, B + 1, 2, 3)``."""
         origins = self.kinematics(q).poses[..., :3, 3]

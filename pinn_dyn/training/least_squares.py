@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import Windows, draw_windows
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.arrays import spd_solve
 from pinn_dyn.mechanics.sliding import hold
 from pinn_dyn.models.learned_constants import LearnedConstants
@@ -49,6 +50,8 @@ _NOISE = 0.2  # largest relative difference of validation errors that may be noi
 _FEWEST_WINDOWS = 10
 _IMPROVED = 0.95  # of the validation error, from which longer windows follow
 _TOLERANCE = 1e-2  # smallest relative decrease of the cost by a step of rollouts
+_HELD = 1e3  # root of the precision of constants that are held
+_SATURATED = 0.01  # filtered share of saturated samples, from which a sample is left out
 _DIVERGED = 1e4  # residual of a diverged rollout
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
@@ -69,7 +72,8 @@ class LeastSquares:
 
     1. Inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), in units of the spread of the
        forces, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. Joints
-       at rest are excluded, since dry friction may then have any value up to its level. If a joint
+       at rest are excluded, since dry friction may then have any value up to its level, and drives
+       near a saturated sample, for limits in the model. If a joint
        has no input, r is the error of the acceleration instead: zero bodies would have no error of
        the force at such a joint. Without any input, no common factor of the forces changes the
        motion, and the mass of the last body stays that of the prior. If the force is not linear
@@ -90,7 +94,8 @@ class LeastSquares:
     constants explain, such as after a contact, do not bend the constants. The covariance of z
     follows from sums over blocks (:func:`~.constants_fit.block_scores`): successive samples or
     neighboring windows, and similar speeds of a joint, at which an error of the friction law
-    repeats.
+    repeats. Optional effects (:meth:`LearnedConstants.absent_parameters`), such as a loss
+    by load, stay only if a fit with them has a smaller validation error than one without.
 
     Args:
         cutoff: cutoff of the filter, Hz, above the frequencies of the motion and below the noise.
@@ -143,14 +148,47 @@ class LeastSquares:
             ValueError: if trajectories are too short for the filter, there are fewer residuals than
                 parameters, the covariance does not fit the model, or changed bodies are unknown.
         """
+        fit = partial(self._fit, trajectories=trajectories, windows=windows, covariance=covariance)
+        fit = partial(fit, stopped=stopped, validate=validate)
+        absent = model.absent_parameters()
+        if absent is None or validate is None or stopped or covariance is not None:
+            return fit(model, keep=keep)
+        simple = copy.deepcopy(model)
+        second, first = fit(model, keep=keep), fit(simple, absent=absent)
+        names = [model.parameter_names()[k] for k in absent.isfinite().nonzero().flatten()]
+        text = f"validation errors {first.errors.mean():.4g} without, {second.errors.mean():.4g}"
+        if second.errors.mean() < first.errors.mean():
+            log.info("least squares keeps %s: %s with", ", ".join(names), text)
+            return second
+        log.info("least squares leaves out %s: %s with", ", ".join(names), text)
+        vector_to_parameters(parameters_to_vector(simple.parameters()), model.parameters())
+        return first
+
+    def _fit(
+        self,
+        model: LearnedConstants,
+        trajectories: Sequence[Trajectory],
+        windows: Windows | None,
+        covariance: Tensor | None,
+        stopped: Fit | None,
+        validate: Callable[[LearnedConstants], Tensor] | None,
+        keep: Callable[[Fit], None] = lambda _: None,
+        absent: Tensor | None = None,
+    ) -> Fit:
+        """Fit all constants, or hold those at the finite values ``absent``, ``(P,)``."""
         count = sum(p.numel() for p in model.parameters())
         precision = next(model.parameters()).dtype
         model.double()
         prior = stopped.prior if stopped else self._prior(model, covariance)
+        if absent is not None:
+            held = absent.isfinite()
+            root = torch.where(held, _HELD, 1.0) * torch.eye(count, dtype=torch.float64)
+            prior = Prior(torch.where(held, absent.double(), prior.mean), root @ prior.root)
+            vector_to_parameters(prior.mean, model.parameters())
         earlier = covariance is not None
         growth: list[Windows] = []
         stages = {}
-        if not self.rollouts or model.input_affine:
+        if not self.rollouts or model.identified_by_forces:
             stages[IDENTIFICATION] = partial(self._identify, model, prior, trajectories, earlier)
         if self.rollouts:
             assert windows is not None
@@ -238,10 +276,14 @@ class LeastSquares:
     def _identify(
         self, model: LearnedConstants, prior: Prior, runs: Sequence[Trajectory], earlier: bool
     ) -> Fit:
-        q, v, a, u = filtered_motion(runs, self.cutoff, self.samples)
-        moves = v.abs() > REST * v.std(0)
+        q, v, a, u = filtered_motion([_marked(model, x) for x in runs], self.cutoff, self.samples)
+        inputs = runs[0].u.shape[-1]
+        u, saturated = u[:, :inputs], u[:, inputs:]
+        moves = (v.abs() > REST * v.std(0)) & (saturated.abs() < _SATURATED)
         if not moves.any():
-            raise ValueError("least squares: no joint moves in the training trajectories")
+            raise ValueError(
+                "least squares: no joint moves in the training trajectories, or all drives saturate"
+            )
         source = f"{len(q)} samples of filtered motion, without joints at rest,"
         remedy = "record longer motions of all joints, or raise optimizer.samples"
         _require_enough(int(moves.sum()), len(prior.mean), source, remedy, earlier)
@@ -351,6 +393,13 @@ class LeastSquares:
         return Fit(
             covariance, information, prior, problem.noise, problem.steps, problem.z, scores=scores
         )
+
+
+def _marked(model: LearnedConstants, run: Trajectory) -> Trajectory:
+    """Return a motion whose inputs are followed by 1 where a drive saturates, ``(T, M + N)``."""
+    with torch.no_grad():
+        u = torch.cat([run.u, model.saturated(run.v.double(), run.u.double())], dim=1).double()
+    return replace(run, input=Signal(run.t, u, run.input.interpolation), past=None)
 
 
 def _evaluate(model: LearnedConstants, residuals: Residuals, z: Tensor, derivative: bool) -> Tensor:

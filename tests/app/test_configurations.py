@@ -24,7 +24,8 @@ from tests.support.contracts import slow_except
 from tests.support.processes import fork
 from tests.support.recorded_logs import LOGS
 
-# Known mechanics need a rigid robot: the experiments on logs train them, with every structure.
+# Known mechanics need a rigid robot: the experiments on logs train them, with every structure, and
+# tests/models/test_drive_limits.py fits their limits and losses.
 RIGID = ("known", "known_and_network")
 MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml") if path.stem not in RIGID)
 LOSSES = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
@@ -34,9 +35,9 @@ EXPERIMENTS = sorted(
 )
 LOG_EXPERIMENTS = ("double_pendulum", "known", "soft_neck", "trunk", "ur10e")
 HEADS = {
-    folder.name: sorted(path.stem for path in folder.glob("*.yaml"))
+    folder.name: sorted(path.stem for path in folder.glob("*.yaml") if path.stem != "load")
     for folder in sorted((CONF / "model").iterdir())
-    if folder.is_dir() and folder.name != "structure"
+    if folder.is_dir() and folder.name not in ("structure", "limits")
 }
 # Configurations that leave a value to the user.
 VALUES = {

@@ -119,6 +119,50 @@ def test_identified_robot():
     assert len(set(torques)) == 1
 
 
+@pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
+def test_contact(home):
+    """The push of 6, -9 and 8 N from 4.0 s on is the only contact."""
+    text = run("contact.py")
+    (contact,) = re.findall(r"the frame +(\S+) +(\S+) +q", text)
+    assert 4.0 <= float(contact[0]) < 4.05 < 4.3 <= float(contact[1]) < 4.45
+    force = [float(x) for x in re.search(r"force \[N\]: \[(.*)\]", text)[1].split(",")]
+    assert force == pytest.approx([6.0, -9.0, 8.0], abs=0.5)
+    assert (home / "contact.png").stat().st_size > 10_000
+
+
+def test_motion_capture(home):
+    assert "q = (mass:X [m], mass:Z [m])" in run("motion_capture.py", "--steps", "2")
+
+
+def test_saturated_drive():
+    without, curve = re.findall(r"m c = (\S+) kg m", run("saturated_drive.py"))
+    assert abs(float(curve) - 0.3) < 0.005 < 0.3 < float(without) - 0.3
+
+
+def test_warm_up(home):
+    """Friction falls to 62 % of 0.3 Nms/rad and 0.2 Nm."""
+    numbers = re.findall(r": \S+ -> (\S+) \(", run("warm_up.py"))
+    assert [float(x) for x in numbers[:2]] == pytest.approx([0.186, 0.124], abs=0.03)
+    assert (home / "warm_up.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
+def test_adaptive_tracking(home):
+    errors = re.findall(r"error (\S+) mrad", run("adaptive_tracking.py"))
+    assert float(errors[1]) < 2 < 50 < float(errors[0])
+    assert (home / "law.c").is_file()
+
+
+def test_randomized_robots(home):
+    """The draws differ most in the mass of the first body, which the motion does not determine."""
+    text = run("randomized_robots.py")
+    masses = [float(x) for x in re.findall(r"mass of link\d: .* to .*, (\S+) %", text)]
+    torque = float(re.search(r"torque: (\S+) %", text)[1])
+    assert masses[0] > 10 > 2 > torque
+    assert len(list((home / "draws").glob("pendulum_*.xml"))) == 5
+
+
 def test_reinforcement_learning(own_log):
     pytest.importorskip("gymnasium", reason="the envs extra is not installed")
     text = run("reinforcement_learning.py", RUN, "--trials=1", "--duration=0.1")

@@ -58,7 +58,11 @@ def test_the_links_may_come_in_any_order_and_an_axis_may_have_any_length():
 WRONG = {
     "empty": (ARM, "", "is not valid XML"),
     "a web page": (ARM, "<!DOCTYPE html><html><br></html>", "it is a web page"),
-    "SDF": (ARM, '<sdf version="1.9"><model name="x"/></sdf>', "is SDF, expected the URDF"),
+    "SDF": (
+        ARM,
+        '<sdf version="1.9"><model name="x"/></sdf>',
+        "is SDF, expected the URDF.*: convert it by pysdf",
+    ),
     "xacro": ("<link", '<x:arm xmlns:x="http://wiki.ros.org/xacro"/><link', "is a xacro file"),
     "a xacro number": ('value="1.5"', 'value="${m}"', "is a xacro file"),
     "no joint": (ARM, '<robot name="x"><link name="a"/></robot>', "there is no <joint>"),

@@ -21,6 +21,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs.columns import known_unit
 from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.motion_capture import one_header
 from pinn_dyn.data.logs.table import Request, Table, vector_columns
 
 _SAMPLE = 300  # lines from which the dialect and the header are detected
@@ -74,6 +75,7 @@ def read_text(path: Path, request: Request) -> Table:
     """
     content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
     text = _decoded(content).replace("\r\n", "\n").replace("\r", "\n")
+    text = one_header(text, request.columns)
     if _BARE_BRACKETS.search(text, 0, 10_000):
         text = _BARE_BRACKETS.sub(r'"\g<0>"', text)
     lines = text.split("\n", _SAMPLE)[:_SAMPLE]

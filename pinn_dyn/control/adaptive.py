@@ -1,0 +1,206 @@
+"""A tracking law that adapts the last body and the friction of its model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field, PositiveFloat
+from torch import Tensor
+
+from pinn_dyn.control.contracts import Motion
+from pinn_dyn.control.laws import Gain, ModelBasedLaw
+from pinn_dyn.mechanics import InputSolver, MechanicalSystem
+from pinn_dyn.mechanics.arrays import matvec, spd_solve
+from pinn_dyn.models.known_constants import PhysicalBodies
+from pinn_dyn.systems import RigidChain
+from pinn_dyn.systems.inertia import inertial_parameters
+
+Part = Literal["payload", "friction", "offset"]
+_STEP = 0.5  # largest change of an adapted constant in a period, relative
+_FACTOR = math.log(5.0)  # largest factor of the friction
+
+
+class AdaptiveTracking(ModelBasedLaw):
+    """The law of Slotine and Li, which adapts constants of a rigid chain while it tracks::
+
+        w = v_r + L (q_r - q),   s = w - v
+        u = A^+ (M dw/dt + C(q, v) w + G + f (D w + F(w)) - o + K_D s)         with J, f, o
+        dJ/dt = g J S J,   df_i/dt = g f_i^2 (D w + F(w))_i s_i,   do_i/dt = -g b_i^2 s_i
+
+    J is the pseudo-inertia of the body that carries the tip, with everything that it has picked up,
+    f_i a factor of the friction of joint i, and o_i a constant torque besides that of the model.
+    S is symmetric with tr(S X) = s^T Y(X) for all X, where Y(J) is the part of the law linear in J.
+
+    Stability: let the plant have the constants J*, f* and o*, and no other difference. With the
+    divergence d(J* || J) = log(det J / det J*) + tr(J^-1 J*) - 4 of positive matrices, and
+    d(f*, f) = log(f / f*) + f* / f - 1,
+
+        V = s^T M s / 2 + (d(J* || J) + sum of d(f*_i, f_i) + sum of (o_i - o*_i)^2 / (2 b_i^2)) / g
+
+    has the derivative dV/dt <= -s^T K_D s, because dM/dt - 2 C is skew-symmetric and friction grows
+    with v. So s goes to zero, and q to q_r. J stays positive, and f between 1/5 and 5 and o between
+    -b and b: limits to an interval with the true value do not increase V. A measured state with
+    noise lets constants drift that the motion does not determine.
+
+    Held for a period T: J <- B (1 - X/2)^-1 (1 + X/2) B^T with J = B B^T and X = g T B^T S B, which
+    is limited to a norm of 1/2 and keeps J positive.
+
+    Sources: Slotine and Li 1987, "On the adaptive control of robot manipulators"; Lee, Kwon and
+    Park 2018, "A natural adaptive control law for robot manipulators".
+
+    Args:
+        model: a :class:`RigidChain`, or known mechanics on one, in float64.
+        position_gain: diagonal of L, 1/s, one number or N.
+        velocity_gain: diagonal of K_D, Nms/rad or Ns/m.
+        rate: g, 1/J. The constants follow an error within about M / (g tau^2) of the torque tau.
+        adapt: constants that adapt: ``"payload"``, ``"friction"`` and ``"offset"``.
+        offset: b, Nm or N.
+        max_condition, solver: as for :class:`ModelBasedLaw`.
+
+    Attributes:
+        memory: logarithmic changes of J (10 parameters) and f, and o / b, of the latest call,
+            ``(*batch, P)``; None before.
+
+    Raises:
+        TypeError: on a model without a rigid chain.
+    """
+
+    def __init__(
+        self,
+        model: MechanicalSystem,
+        position_gain: Gain,
+        velocity_gain: Gain,
+        *,
+        rate: PositiveFloat = 1.0,
+        adapt: Sequence[Part] = ("payload", "friction"),
+        offset: PositiveFloat = 1.0,
+        max_condition: Annotated[float, Field(ge=1)] = 1e6,
+        solver: InputSolver | None = None,
+    ):
+        chain: Any = getattr(model, "structure", model)
+        if not isinstance(chain, RigidChain):
+            raise TypeError(
+                f"a {type(model).__name__} has no rigid chain whose bodies could adapt: use "
+                "model=known with a URDF"
+            )
+        self.chain, self.rate, self.offset = chain, float(rate), float(offset)
+        self.adapt = tuple(adapt)
+        bodies: Any = getattr(model, "bodies", None)
+        inertia = chain.inertia if bodies is None else bodies().detach()
+        body = chain._tip_body
+        self._bodies = PhysicalBodies(inertia[body : body + 1], 1.0, [chain.body_names[body]])
+        self._bodies.double().requires_grad_(False)
+        self._columns = slice(10 * body, 10 * body + 10)
+        self._parts = torch.func.jacrev(inertial_parameters)(inertia[body].double())
+        n = chain.num_coordinates
+        sizes = {"payload": 10, "friction": n, "offset": n}
+        self.sizes = [sizes[part] if part in self.adapt else 0 for part in sizes]
+        self.memory_size = sum(self.sizes)
+        super().__init__(
+            model, position_gain, velocity_gain, max_condition=max_condition, solver=solver
+        )
+
+    def reset(self) -> None:
+        super().reset()
+        self.memory: Tensor | None = None
+        self._time, self._changes = 0.0, torch.zeros(())
+
+    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        with torch.no_grad():
+            if self.memory is None or self.memory.shape[:-1] != q.shape[:-1]:
+                self.memory = q.new_zeros(*q.shape[:-1], self.memory_size)
+            elif t > self._time:
+                self.memory = self.adapted(self.memory, self._changes, t - self._time)
+            u = super().__call__(t, q, v, reference)
+            self._time, self._changes = t, self.changes(q, v, reference, self.memory)
+        return u
+
+    def law_of(self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor) -> Tensor:
+        """Return u ``(*batch, M)`` with the constants of a memory, without side effects."""
+        self.memory = memory
+        return self._input(q, v, reference, None, all_steps=True)[0]
+
+    def changes(self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor) -> Tensor:
+        """Return the rates of change B^T S B, of log f and of o / b, ``(*batch, R)``."""
+        w, rate = self._wanted(q, v, reference)
+        error = w - v
+        parts = []
+        if self.sizes[0]:
+            weights = (error.unsqueeze(-1) * self._regressor(q, v, w, rate)).sum(-2)
+            S = (weights @ self._parts.flatten(1)).unflatten(-1, (4, 4))
+            B = torch.linalg.cholesky(self._inertia(memory))
+            parts.append((B.mT @ (0.5 * (S + S.mT)) @ B).flatten(-2))
+        _, factor, _ = self._constants(memory)
+        if self.sizes[1]:
+            parts.append(factor * self.model.dissipative_force(q, w) * error)
+        if self.sizes[2]:
+            parts.append(-self.offset * error)
+        return self.rate * torch.cat(parts, dim=-1)
+
+    def adapted(self, memory: Tensor, changes: Tensor, period: float) -> Tensor:
+        """Return the memory after a period in s with constant changes."""
+        body, friction, offset = memory.split(self.sizes, dim=-1)
+        first = 16 if self.sizes[0] else 0
+        moved, *others = changes.split([first, *self.sizes[1:]], dim=-1)
+        if first:
+            X = period * moved.unflatten(-1, (4, 4))
+            X = X / (1 + X.square().sum((-2, -1), keepdim=True).sqrt() / _STEP)
+            unit = torch.eye(4).to(X)
+            B = torch.linalg.cholesky(self._inertia(memory))
+            inertia = B @ spd_solve((unit - X / 2).unsqueeze(-3), (unit + X / 2).mT) @ B.mT
+            body = self._bodies.parameters_of(inertia.unsqueeze(-3)).squeeze(-2)
+        steps = [(period * x).clamp(-_STEP, _STEP) for x in others]
+        friction = (friction + steps[0]).clamp(-_FACTOR, _FACTOR)
+        return torch.cat([body, friction, (offset + steps[1]).clamp(-1, 1)], dim=-1)
+
+    def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, None]:
+        assert self.memory is not None
+        w, rate = self._wanted(q, v, reference)
+        change, factor, offset = self._constants(self.memory)
+        zero = torch.zeros_like(v)
+        model = self.model
+        # C(q, v) w by the polarization of C(q, v) v, whose symbols are symmetric in v and w.
+        coriolis = model._inertial_force(q, v + w, zero) - model._inertial_force(q, v - w, zero)
+        tau = model._inertial_force(q, zero, rate) + coriolis / 4 + model.potential_force(q)
+        tau = tau + factor * model.dissipative_force(q, w) - offset
+        if self.sizes[0]:
+            tau = tau + matvec(self._regressor(q, v, w, rate), change)
+        return tau + self.velocity_gain.to(q) * (w - v), None
+
+    def _wanted(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
+        """Return w and dw/dt."""
+        gain = self.position_gain.to(q)
+        return (
+            reference.v + gain * (reference.q - q),
+            reference.a + gain * (reference.v - v),
+        )
+
+    def _regressor(self, q: Tensor, v: Tensor, w: Tensor, rate: Tensor) -> Tensor:
+        """Return Y ``(*batch, N, 10)`` of the adapted body in M dw/dt + C(q, v) w + G."""
+        zero = torch.zeros_like(v)
+        at_rest = self.chain.regressor(q, zero, rate)
+        both, apart = (self.chain.regressor(q, x, zero) for x in (v + w, v - w))
+        return (at_rest + (both - apart) / 4)[..., self._columns]
+
+    def _inertia(self, memory: Tensor) -> Tensor:
+        """Return J, ``(*batch, 4, 4)``."""
+        z = memory[..., : self.sizes[0]] if self.sizes[0] else memory.new_zeros(10)
+        return self._bodies.inertia_of(z.unsqueeze(-2)).squeeze(-3)
+
+    def _constants(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the change of the ten parameters, f and o."""
+        _, friction, offset = memory.split(self.sizes, dim=-1)
+        one = memory.new_ones(self.chain.num_coordinates)
+        change = inertial_parameters(self._inertia(memory) - self._bodies.start()[0])
+        factor = friction.exp() if self.sizes[1] else one
+        return change, factor, self.offset * offset if self.sizes[2] else 0 * one
+
+    def diagnostics(self) -> dict[str, Tensor]:
+        """Return those of the law, and ``adapted_mass``, the mass of the adapted body, kg."""
+        if self.memory is None:
+            return {}
+        mass = {"adapted_mass": self._inertia(self.memory)[..., 3, 3]} if self.sizes[0] else {}
+        return super().diagnostics() | mass

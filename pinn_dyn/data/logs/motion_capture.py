@@ -1,0 +1,122 @@
+"""Text files of motion capture: several header rows become a header and a row of units.
+
+The files repeat the names X, Y and Z below the names of markers, rigid bodies and segments. Here a
+column is ``marker:X``. A name that occurs again gets a number, ``marker:X #2``.
+
+- OptiTrack Motive: rows Type, Name, ID and Parent above the quantity and the axis. Rotations of
+  rigid bodies are ``body:rotation X``.
+- Vicon Nexus: sections such as Trajectories, each with its rate, names, axes and units. The section
+  that holds the largest number of requested columns is read.
+- Qualisys: ``MARKER_NAMES`` above the rows, with or without a row of column names.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Collection, Sequence
+from itertools import accumulate
+
+_SECTION = re.compile(r"(Devices|Events|Joints|Model Outputs|Segments|Trajectories)[,;\t ]*")
+_LENGTHS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
+_AXES = ("X", "Y", "Z")
+
+
+def one_header(text: str, requested: Collection[str]) -> str:
+    """Return a text file with one header, on the same lines; other files as they are.
+
+    Args:
+        text: the file.
+        requested: columns that a data set needs.
+    """
+    start = text[:2000].lstrip()
+    if start.startswith("Format Version"):
+        return _motive(text)
+    if _SECTION.fullmatch(start.partition("\n")[0]):
+        return _vicon(text, requested)
+    return _qualisys(text) if start.startswith("NO_OF_FRAMES") else text
+
+
+def _motive(text: str) -> str:
+    lines = text.split("\n")
+    last = next((k for k, x in enumerate(lines) if x.startswith(("Frame,", '"Frame"'))), 0)
+    rows = [_cells(line, ",") for line in lines[: last + 1]]
+    named = next((x for x in rows if x[1:2] == ["Name"]), None)
+    if named is None:
+        return text
+    quantities, axes = rows[last - 1], rows[last]
+    length = next((unit for cell in rows[0] if (unit := _LENGTHS.get(cell.lower()))), "")
+    names, units = axes[:2], ["", "s"]
+    for name, quantity, axis in zip(named[2:], quantities[2:], axes[2:], strict=False):
+        kind = "" if quantity == "Position" else quantity.lower()
+        names.append(f"{name}:{' '.join(filter(None, [kind, axis]))}")
+        units.append("" if kind else length)
+    return _with_header(lines, last - 1, last + 1, names, units, ",")
+
+
+def _vicon(text: str, requested: Collection[str]) -> str:
+    lines = text.split("\n")
+    starts = [k for k, line in enumerate(lines) if _SECTION.fullmatch(line.strip())]
+    best: tuple[int, int, list[str], str] = (-1, 0, [], ",")
+    for start in starts:
+        separator = next((x for x in "\t;," if x in "".join(lines[start + 2 : start + 4])), ",")
+        owners, axes = (_cells(x, separator) for x in [*lines, "", ""][start + 2 : start + 4])
+        owners += [""] * (len(axes) - len(owners))
+        filled = accumulate(owners[: len(axes)], _latest)
+        names = [f"{x}:{axis}" if x else axis for x, axis in zip(filled, axes, strict=True)]
+        matches = len({*names} & {*requested})
+        if matches > best[0]:
+            best = matches, start, names, separator
+    _, start, names, separator = best
+    end = next((k for k in starts if k > start), len(lines))
+    units = _cells("".join(lines[start + 4 : start + 5]), separator)
+    return _with_header(lines[:end], start + 3, start + 5, names, units, separator)
+
+
+def _qualisys(text: str) -> str:
+    lines = text.split("\n")
+    separator = "\t" if "\t" in lines[0] else ","
+    rows = [_cells(line, separator) for line in lines[:60]]
+    first = next((k for k, x in enumerate(rows) if re.fullmatch(r"-?\d+([.]\d*)?", x[0])), 0)
+    markers = next((x[1:] for x in rows if x[0] == "MARKER_NAMES"), [])
+    columns = [f"{name}:{axis}" for name in markers if name for axis in _AXES]
+    if not columns or first < 2:
+        return text
+    extra = max(len([x for x in rows[first] if x]) - len(columns), 0)
+    names = [*["Frame", "Time"][:extra], *columns]
+    units = [*["", "s"][:extra], *["mm"] * len(columns)]
+    return _with_header(lines, first - 2, first, names, units, separator)
+
+
+def _with_header(
+    lines: Sequence[str],
+    header: int,
+    first: int,
+    names: Sequence[str],
+    units: Sequence[str],
+    separator: str,
+) -> str:
+    """Return the lines with the rows from ``first`` on below one header and a row of units."""
+    counts: dict[str, int] = {}
+    unique = []
+    for name in names:
+        counts[name] = counts.get(name, 0) + 1
+        unique.append(name if counts[name] == 1 else f"{name} #{counts[name]}")
+    above = [""] * header + [_joined(unique, separator), _joined(units, separator)]
+    above += [""] * (first - len(above))
+    return "\n".join([*above, *lines[first:]])
+
+
+def _latest(last: str, name: str) -> str:
+    return name or last
+
+
+def _joined(cells: Sequence[str], separator: str) -> str:
+    text = io.StringIO()
+    csv.writer(text, delimiter=separator, lineterminator="").writerow(cells)
+    return text.getvalue()
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])] or [""]

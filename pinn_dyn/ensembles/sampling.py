@@ -1,0 +1,115 @@
+"""Physically possible robots from the posterior of a least-squares fit."""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants
+
+_STEPS_PER_DIMENSION = 10
+_MARGIN = 0.999  # of the way to the border of what is possible
+
+
+def sampled_models(model: Predictor, covariance: Tensor, count: int, seed: int) -> list[Predictor]:
+    """Draw models from the posterior of their constants.
+
+    The force of the model is linear in the pseudo-inertias J of the bodies and in most positive
+    constants c, but not in their parameters z. The draws have the normal distribution of J and c
+    with the posterior covariance C of z, restricted to what is possible::
+
+        J = J_fit + (dJ/dz) e,   c = c_fit + (dc/dz) e,   e ~ N(0, C),   J > 0,   c > 0
+
+    In directions that the data do not determine, C is the covariance of the prior. So draws keep
+    all forces that the data determine, also where the prior is wide, and every body has a positive
+    density. A hit-and-run sampler draws them: along a random direction, e is normal on the interval
+    of what is possible. Source: Smith 1984, Efficient Monte Carlo procedures for generating points
+    uniformly distributed over bounded regions.
+
+    Args:
+        model: model with the fitted z.
+        covariance: C, ``(P, P)``.
+        count: number of draws.
+        seed: seed of the draws.
+
+    Returns:
+        Copies of the model in float64 with drawn constants.
+    """
+    model = copy.deepcopy(model).double().requires_grad_(False)
+    z = parameters_to_vector(model.parameters())
+    limits = _Limits(model, len(z))
+    noise = _possible(limits, torch.linalg.cholesky(covariance.double()), count, seed)
+    models = []
+    for values in limits.parameters_of(z, noise):
+        member = copy.deepcopy(model)
+        vector_to_parameters(values, member.parameters())
+        models.append(member)
+    return models
+
+
+class _Limits:
+    """Limits of a shift e ``(*batch, P)`` of the parameters, linear in bodies and constants."""
+
+    def __init__(self, model: nn.Module, size: int):
+        self.rate = torch.zeros(size, dtype=torch.float64)  # of positive constants, relative
+        self.bodies: list[tuple[PhysicalBodies, slice, Tensor]] = []
+        positions, first = {}, 0
+        for parameter in model.parameters():
+            positions[id(parameter)] = slice(first, first + parameter.numel())
+            first += parameter.numel()
+        for part in model.modules():
+            if isinstance(part, PositiveConstants):
+                self.rate[positions[id(part.z)]] = part.spread
+            elif isinstance(part, PhysicalBodies):
+                slopes = torch.func.jacrev(part.inertia_of)(part.z)
+                item = part, positions[id(part.z)], slopes.reshape(-1, part.z.numel())
+                self.bodies.append(item)
+
+    def inertias(self, shift: Tensor) -> list[Tensor]:
+        """Return the change of J of each group of bodies, ``(*batch, n, 4, 4)``."""
+        return [
+            (shift[..., part] @ slopes.T).unflatten(-1, (-1, 4, 4))
+            for _, part, slopes in self.bodies
+        ]
+
+    def reach(self, shift: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the least and the largest s for which shift + s direction is possible."""
+        # All factors 1 + s x of sizes and eigenvalues stay positive.
+        factors = [self.rate * direction / (1 + self.rate * shift)]
+        changes = zip(self.bodies, self.inertias(shift), self.inertias(direction), strict=True)
+        for (bodies, _, _), moved, change in changes:
+            root = torch.linalg.cholesky(bodies() + moved)
+            half = torch.linalg.solve_triangular(root, change, upper=False)
+            whitened = torch.linalg.solve_triangular(root, half.mT, upper=False)
+            factors.append(torch.linalg.eigvalsh(whitened).flatten(1))
+        values = torch.cat(factors, dim=-1)
+        largest, least = values.amax(1).clamp(min=1e-9), values.amin(1).clamp(max=-1e-9)
+        return -_MARGIN / largest, -_MARGIN / least
+
+    def parameters_of(self, z: Tensor, shift: Tensor) -> Tensor:
+        """Return z of shifted bodies and constants, ``(*batch, P)``."""
+        rate = self.rate.clamp(min=1e-300)
+        values = z + torch.where(self.rate > 0, torch.log1p(rate * shift) / rate, shift)
+        for (bodies, part, _), moved in zip(self.bodies, self.inertias(shift), strict=True):
+            values[:, part] = bodies.parameters_of(bodies() + moved).flatten(1)
+        return values
+
+
+def _possible(limits: _Limits, root: Tensor, count: int, seed: int) -> Tensor:
+    """Return e = R w with w ~ N(0, I), restricted to the limits, ``(count, P)``."""
+    generator = torch.Generator().manual_seed(seed)
+    w = torch.zeros(count, len(root), dtype=torch.float64)
+    for _ in range(_STEPS_PER_DIMENSION * len(root)):
+        direction = torch.randn(w.shape, generator=generator).to(w)
+        direction = direction / direction.norm(dim=-1, keepdim=True)
+        lowest, highest = limits.reach(w @ root.T, direction @ root.T)
+        center = -(w * direction).sum(-1)
+        low, high = (torch.special.ndtr(end - center) for end in (lowest, highest))
+        level = low + (high - low) * torch.rand(count, generator=generator).to(w)
+        step = center + torch.special.ndtri(level.clamp(1e-12, 1 - 1e-12))
+        w = w + torch.maximum(torch.minimum(step, highest), lowest)[:, None] * direction
+    return w @ root.T

@@ -1,0 +1,112 @@
+"""Limits of the torque of a drive: current, and voltage by a torque-speed curve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import NonNegativeFloat, PositiveFloat
+from torch import Tensor, nn
+
+from pinn_dyn.models.known_constants import Constants, Named
+from pinn_dyn.models.scales import Scales
+
+_SHARPNESS = 16  # the torque is 0.96 of its limit where the command reaches the limit
+_BEYOND = 100.0  # ratio to the limit beyond which the torque is constant
+_LINEAR = 0.8  # ratio below which the torque is that of the command to 0.2 %
+_REACHABLE = 0.98  # of the limit, for which a command exists
+_SMALLEST = 1e-3  # smallest limit in units of that at rest, beyond the no-load speed
+
+Limit = PositiveFloat | Sequence[PositiveFloat] | Literal["learned"] | None
+
+
+class DriveLimits(nn.Module):
+    """Torque tau of a drive whose command asks for the torque s, as of a DC motor::
+
+        l(w) = min(L, S (1 - w / w_0)),    -l(-v) <= tau <= l(v)
+        tau = c + h x / (1 + |x|^16)^(1/16),    x = (s - c) / h,    c, h = (l(v) -+ l(-v)) / 2
+
+    L is the torque of the largest current, S the stall torque and w_0 the no-load speed, both at
+    the largest voltage. In braking, only the current is a limit. Beyond w_0, l is 0.001 of its
+    value at rest. Symbols: L and S ``(n,)`` in Nm or N, w_0 in rad/s or m/s, s, tau and v
+    ``(*batch, n)``, all at the joint. Assumptions: a stiff gear, constant voltage and temperature.
+    Source: Spong, Hutchinson, Vidyasagar 2006, Robot Modeling and Control, sec. 6.2.
+
+    Args:
+        scales: scales of the n driven joints. The value is the typical torque, ``(n,)``.
+        limit: L, one number or n; ``"learned"``; or None for no limit of the current.
+        stall: S, likewise; needs ``no_load_speed``.
+        no_load_speed: w_0, likewise.
+        spread: prior standard deviation of the logarithm of learned limits.
+
+    Raises:
+        ValueError: if all limits are None, or only one of ``stall`` and ``no_load_speed`` is set.
+    """
+
+    def __init__(
+        self,
+        scales: Scales,
+        *,
+        limit: Limit = None,
+        stall: Limit = None,
+        no_load_speed: Limit = None,
+        spread: NonNegativeFloat = 1.0,
+    ):
+        super().__init__()
+        if (stall is None) != (no_load_speed is None) or (limit is None and stall is None):
+            raise ValueError(
+                f"limits has limit {limit}, stall {stall} and no_load_speed {no_load_speed}, "
+                "expected a limit, or stall and no_load_speed together, or all three"
+            )
+        joints, unlimited = scales.joints, torch.finfo(torch.float32).max
+        forces = [joint.force for joint in joints]
+        speed = torch.full_like(scales.value, float(scales.statistics.v_std.mean()))
+        self.learned = nn.ModuleDict()
+        for name, label, value, typical, units in (
+            ("limit", "torque limit", limit, scales.value, forces),
+            ("stall", "stall torque", stall, 2 * scales.value, forces),
+            ("speed", "no-load speed", no_load_speed, 3 * speed, [x.speed for x in joints]),
+        ):
+            if value == "learned":
+                self.learned[name] = scales.positive(label, 1.0, typical, spread or 1.0, units)
+                value = None
+            number = torch.as_tensor(unlimited if value is None else value, dtype=torch.float32)
+            self.register_buffer(f"fixed_{name}", number.expand(len(joints)).clone())
+
+    def forward(self, force: Tensor, v: Tensor) -> Tensor:
+        """Return tau, ``(*batch, n)``, of the commanded force at v."""
+        center, half = self._range(v)
+        ratio = ((force - center) / half).clamp(-_BEYOND, _BEYOND)
+        return center + half * ratio / (1 + ratio**_SHARPNESS) ** (1 / _SHARPNESS)
+
+    def saturated(self, force: Tensor, v: Tensor) -> Tensor:
+        """Return where the torque is not that of the command, ``(*batch, n)``, bool."""
+        center, half = self._range(v)
+        return (force - center).abs() > _LINEAR * half
+
+    def reachable(self, force: Tensor, v: Tensor) -> Tensor:
+        """Return the nearest force for which there is a command, ``(*batch, n)``."""
+        center, half = self._range(v)
+        return force.clamp(center - _REACHABLE * half, center + _REACHABLE * half)
+
+    def at_rest(self) -> Tensor:
+        """Return the largest torque at rest, min(L, S), ``(n,)``."""
+        return torch.minimum(self._value("limit"), self._value("stall"))
+
+    def physical_constants(self) -> list[Named]:
+        """Return the learned limits."""
+        return [x.named() for x in self.learned.values() if isinstance(x, Constants)]
+
+    def _value(self, name: str) -> Tensor:
+        return self.learned[name]() if name in self.learned else self.get_buffer(f"fixed_{name}")
+
+    def _range(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return c and h, ``(*batch, n)``."""
+        most = self.at_rest()
+        stall, speed = self._value("stall"), self._value("speed")
+        ends = [
+            torch.minimum(most, stall - stall / speed * w).clamp_min(0.0) + _SMALLEST * most
+            for w in (v, -v)
+        ]
+        return (ends[0] - ends[1]) / 2, (ends[0] + ends[1]) / 2
