@@ -40,7 +40,8 @@ v, a = np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis
 tau = true_arm.rigid_force(*map(torch.from_numpy, (q, v, a))).numpy()
 tau += np.random.default_rng(0).normal(size=q.shape) * 0.01
 names = {name: [f"{name}_{joint}" for joint in arm.joint_names] for name in ("q", "v", "tau")}
-log = pd.DataFrame(np.hstack([q, v, tau]), columns=sum(names.values(), [])).assign(t=t)
+columns = [column for signal in names.values() for column in signal]
+log = pd.DataFrame(np.hstack([q, v, tau]), columns=columns).assign(t=t)
 model = partial(KnownMechanics, structure=arm)
 solver = LeastSquares(cutoff=6.0, rollouts=False)
 run = pinn_dyn.fit(log, q=names["q"], v=names["v"], u=names["tau"], model=model, optimizer=solver)

@@ -283,7 +283,7 @@ def test_rows_of_a_model_are_compiled_once_for_all_processes(monkeypatch, cached
     fast = c_loop.rows_in_c(model, "a", function, rows)
     assert fast is not function
     torch.testing.assert_close(fast(rows), function(rows), rtol=1e-10, atol=1e-12)
-    with pytest.raises(ValueError, match="shape|expected"):
+    with pytest.raises(ValueError, match=r"shape|expected"):
         fast(rows[:, :8])
     c_loop._ROWS.clear()
     c_loop._WITHOUT.clear()
