@@ -1,6 +1,6 @@
 """Train a policy on an identified robot with Stable-Baselines3, and try it on the true robot.
 
-python examples/train_policy.py [--steps 400000]       pip install stable-baselines3
+python examples/train_policy.py [--steps 200000]       pip install stable-baselines3
 
 The robot is a double pendulum of 1.5 times the masses of its URDF. PPO learns in 64 robots with
 constants drawn from the identification. The reward of an episode of 2 s is -|q - goal|^2 for every
@@ -26,9 +26,10 @@ from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--steps", type=int, default=400_000, help="steps of all robots together")
+parser.add_argument("--steps", type=int, default=200_000, help="steps of all robots together")
 parser.add_argument("--robots", type=int, default=64)
 args = parser.parse_args()
+torch.set_num_threads(1)
 urdf = str(Path(__file__).with_name("double_pendulum.urdf"))
 arm, true_arm = RigidChain(urdf), RigidChain(urdf, mass_scale=1.5)
 
@@ -86,7 +87,10 @@ class Robots(VecEnv):
 
 
 settings = {"step": 0.02, "duration": 2.0, "u_low": [-12, -5], "u_high": [12, 5]}
-robots = RobotVectorEnv(run, args.robots, autoreset=AutoresetMode.SAME_STEP, **settings)
+draws = run.sample(args.robots, seed=0)
+robots = RobotVectorEnv(
+    run, args.robots, draws=draws, autoreset=AutoresetMode.SAME_STEP, **settings
+)
 policy = PPO("MlpPolicy", Robots(robots), n_steps=50, batch_size=640, gamma=0.95, seed=0)
 policy.learn(args.steps)
 

@@ -170,6 +170,20 @@ def test_reinforcement_learning(own_log):
 
 
 @pytest.mark.slow
+def test_mppi(home):
+    """Two control instants: the arm begins to move within its limits."""
+    pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
+    text = run("mppi.py", "--duration", "0.04")
+    assert float(re.search(r"largest speed: ([\d.]+)", text)[1]) < 1
+    assert float(re.search(r"goal: ([\d.]+)", text)[1]) < 0.6
+
+
+def test_train_policy(home):
+    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
+    text = run("train_policy.py", "--steps", "400", "--robots", "4")
+    assert len(re.findall(r"mean return on the .* without input", text)) == 2
+
+
 def test_ensemble_with_spread():
     lines = run("ensemble_with_spread.py", "--members", "2", "--steps", "2").splitlines()
     head = next(k for k, line in enumerate(lines) if line.split() == ["t", "error", "spread"])
