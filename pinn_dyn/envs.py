@@ -292,7 +292,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     ``distances()`` returns the distances from the training data.
 
     Args:
-        robot: a run or its folder, a mechanical system, or a plant of K robots.
+        robot: a run or its folder, or a :class:`ModelPlant`.
         num_envs: K.
         data, step, duration, u_low, u_high: see :class:`RobotEnv`.
         reward: rewards of a step for arrays of K robots; None for the distance to a goal.
@@ -302,13 +302,12 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         autoreset: when a robot starts again.
 
     Raises:
-        TypeError: if the model is not a mechanical system, ``data`` is missing, or ``draws`` are
-            given without a run.
+        TypeError: on another robot, if ``data`` is missing, or for ``draws`` without a run.
     """
 
     def __init__(
         self,
-        robot: Run | MechanicalSystem | Plant | str | Path,
+        robot: Run | ModelPlant | str | Path,
         num_envs: PositiveInt,
         *,
         data: Run | DataSource | None = None,
@@ -324,6 +323,8 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         task = _Task(robot, data, step, (u_low, u_high), draws, threads)
         if not isinstance(task.plant, ModelPlant):
             raise TypeError("a vector of robots needs a run: use gymnasium.make_vec for others")
+        if draws is not None and isinstance(robot, ModelPlant):
+            raise TypeError("draws need a run: give them to the ModelPlant")
         self.num_envs, self.plant, self.dt, self.region = num_envs, task.plant, task.dt, task.region
         self.reward, self.steps = reward, max(1, round(duration / self.dt))
         self._starts = task.q.numpy(), task.v.numpy()

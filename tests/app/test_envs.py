@@ -21,6 +21,7 @@ from tests.support.urdf_by_hand import SPATIAL
 
 gymnasium = pytest.importorskip("gymnasium", reason="the envs extra is not installed")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.vector import AutoresetMode  # noqa: E402
 
 from pinn_dyn.envs import ModelPlant, RobotEnv, RobotVectorEnv  # noqa: E402
 
@@ -272,6 +273,27 @@ def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
         is_over = terminated | truncated
     assert size == run.model.num_coordinates
     assert env.observation_space.contains(observations)
+
+
+def test_robots_may_start_again_in_the_same_step(lnn_run):
+    run = pinn_dyn.load(lnn_run)
+    later, same = (
+        RobotVectorEnv(run, 2, duration=0.03, autoreset=mode)
+        for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+    )
+    for env in (later, same):
+        env.reset(seed=3)
+        env.action_space.seed(0)
+    for _ in range(later.steps):
+        actions = later.action_space.sample()
+        expected, *_ = later.step(actions)
+        started, _, terminated, truncated, infos = same.step(actions)
+    assert (terminated | truncated).all()
+    np.testing.assert_array_equal(infos["final_obs"], expected)
+    assert (started != expected).any(1).all()
+    moved, rewards, *_ = same.step(actions)
+    assert (moved != started).any(1).all()
+    assert rewards.all()
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
