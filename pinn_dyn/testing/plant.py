@@ -46,7 +46,8 @@ class PlantContract:
             tensors += tuple(results)
             before += [value.clone() for value in results]
         for first, second in zip(*runs, strict=True):
-            assert torch.equal(first, second)
+            # Code in C may replace Python from some step on.
+            torch.testing.assert_close(first, second, rtol=1e-10, atol=1e-12)
         for value, original in zip(tensors, before, strict=True):
             assert torch.equal(value, original)
 
