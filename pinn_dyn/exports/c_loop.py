@@ -332,6 +332,8 @@ def rows_in_c(
         is_worth = _WITHOUT[key] >= STEPS or (is_new and recall(key) is not None)
         if not is_worth or find_compiler() is None:
             return function
+        if len(_ROWS) >= _MOST_LOOPS:
+            _ROWS.clear()
         _ROWS[key] = compiled_rows(function, rows.reshape(-1, rows.shape[-1])[0], key)
     return _ROWS[key]
 
