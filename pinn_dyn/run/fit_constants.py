@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import logging
 import signal
 import sys
@@ -33,10 +34,13 @@ from pinn_dyn.run.build import ConfigError, naming
 from pinn_dyn.run.prepared import PreparedTraining
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
+from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
 
 log = logging.getLogger(__name__)
 
+_DEFAULTS: list[Any] = [("accelerator", "cpu"), ("devices", 1)]  # in conf
+_DEFAULTS += [("gradient_clip_val", 1.0), ("gradient_clip_val", None)]
 _SHOWN = 2  # directions in the log
 _MOVE = "Move {} at more frequencies, poses and speeds. excite.py designs such a motion."
 _NO_MOTION = (
@@ -50,6 +54,24 @@ _SCALE = (
     "model.gain_spread=0. If a body is known, set a small prior for it, as "
     "'model.spread={{default: 3, {}: 0.01}}'."
 )
+
+
+def check_trainer(settings: Mapping[str, Any]) -> None:
+    """Refuse settings that :class:`lightning.Trainer` does not have; warn that others are unused.
+
+    A fit of constants has no trainer.
+    """
+    changed = [key for key, value in settings.items() if (key, value) not in _DEFAULTS]
+    if not changed:  # without the import of Lightning
+        return
+    from lightning import Trainer
+
+    names = list(inspect.signature(Trainer).parameters)
+    for key in changed:
+        if key not in names:
+            hint = did_you_mean(key, names) or ": lightning.Trainer has no such argument"
+            raise ConfigError(f"trainer has no key {key!r}{hint}")
+    log.warning("least squares does not use trainer.%s", ", trainer.".join(changed))
 
 
 def fit_constants(

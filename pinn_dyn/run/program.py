@@ -20,7 +20,9 @@ def program() -> list[str]:
     path = Path(sys.argv[0])
     if path.suffix == ".py":
         return ["python", str(path)]
-    return [path.name if shutil.which(path.name) else str(path)]
+    by_name = shutil.which(path.name)
+    is_found = by_name is not None and Path(by_name).resolve() == path.resolve()
+    return [path.name if is_found else str(path)]
 
 
 def hush() -> None:

@@ -31,7 +31,7 @@ from pinn_dyn.models import (
 )
 from pinn_dyn.run.build import ModelBuilder
 from pinn_dyn.run.described import described
-from pinn_dyn.run.fit_constants import fit_constants
+from pinn_dyn.run.fit_constants import check_trainer, fit_constants
 from pinn_dyn.run.known_data import match_model
 from pinn_dyn.run.prepared import prepare, same_data
 from pinn_dyn.run.program import hush
@@ -254,6 +254,7 @@ def _length(
 ) -> tuple[int, int, dict[str, Any]]:
     """Return steps, validations and further settings of the trainer; a fit is a single step."""
     if isinstance(optimizer, LeastSquares):
+        check_trainer(trainer)
         return 1, 1, {key: x for key, x in trainer.items() if not key.startswith("gradient_clip")}
     is_log = isinstance(source, LogSource)
     steps = steps or (LOG_STEPS if is_log else STEPS)

@@ -8,6 +8,7 @@ import pytest
 
 import pinn_dyn
 from pinn_dyn.data import DynamicsData
+from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import KnownMechanics
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares
@@ -54,6 +55,24 @@ def test_seconds_of_a_log_give_the_constants(tmp_path, seconds, rate):
         0.3, rel=0.05
     )
     assert run.metrics["validation"]["val/error_mean"] < 0.02
+
+
+def test_a_fit_refuses_what_no_trainer_has_and_names_what_it_does_not_use(caplog):
+    fit = partial(
+        pinn_dyn.fit,
+        short_log(2, 50),
+        q="q",
+        v="v",
+        u="tau",
+        model=partial(KnownMechanics, structure=RigidChain(ROD)),
+        optimizer=LeastSquares(cutoff=8.0, rollouts=False, evaluations=2),
+        validator=partial(RolloutValidator, horizon=0.1),
+    )
+    with pytest.raises(ValueError, match=r"no key 'acelerator': did you mean accelerator\?$"):
+        fit(trainer={"acelerator": "cpu"})
+    fit(trainer={"accelerator": "cpu", "gradient_clip_val": 1.0, "precision": "bf16-mixed"})
+    text = "least squares does not use"
+    assert [x for x in caplog.messages if text in x] == [f"{text} trainer.precision"]
 
 
 def test_all_windows_are_used_if_there_are_fewer_than_pairs(short_source):

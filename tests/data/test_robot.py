@@ -271,8 +271,8 @@ def test_everything_else_imports_without_a_simulator(tmp_path):
             del sys.modules[name]
         for name in ("pybullet", "pybullet_data", "mujoco", "gymnasium"):
             sys.modules[name] = None
-        for name in ("pinn_dyn.app.train", "pinn_dyn.data", "pinn_dyn.evaluation"):
-            importlib.import_module(name)
+        for name in ("app.train", "run.trainer", "data", "evaluation"):
+            importlib.import_module(f"pinn_dyn.{name}")
         systems = importlib.import_module("pinn_dyn.systems")
         systems.SoftArm()
         for name, extra in (("BulletArm", "panda"), ("MujocoArm", "mujoco")):
