@@ -12,7 +12,7 @@ from pinn_dyn.systems.urdf_file import is_mjcf
 
 _PACKAGES = (
     *("control", "data", "data.logs", "evaluation", "mechanics", "models", "systems"),
-    "training",
+    *("training", "training.losses"),
 )
 """Packages of pinn_dyn whose public classes may be built: none writes files or loads code."""
 

@@ -111,7 +111,8 @@ def test_options_in_the_text_exist(files):
     for page in PAGES:
         if page.stem == "CHANGELOG":  # has former options
             continue
-        folders = [*FOLDERS, *(path for path in files[page].glob("*conf") if path.is_dir())]
+        own = [path for name in ("*conf", "*conf/control") for path in files[page].glob(name)]
+        folders = [*FOLDERS, *(path for path in own if path.is_dir())]
         for group, option in MENTION.findall(page.read_text()):
             path = f"{group}/{option}.yaml"
             known = any((folder / path).is_file() for folder in folders)
