@@ -1,4 +1,4 @@
-"""Logs of simulated robots, clean and with a planted fault, and the words of their check."""
+"""Logs of simulated robots, clean and with a planted fault, and what their check says."""
 
 import functools
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -14,13 +15,17 @@ from pinn_dyn.data.logs.runs import INERTIA
 from pinn_dyn.evaluation.log_check import check
 from pinn_dyn.evaluation.structure_check import SCALE
 from pinn_dyn.systems import RigidChain
-from tests.support import delayed_robots
+from tests.support import delayed_robots, underactuated
+from tests.support.random_chains import random_chain
 from tests.support.sticking_arms import Arms, mass_and_bias
+from tests.support.underactuated import ACROBOT, PENDUBOT
 
 RATE, SECONDS, RUNS = 100.0, 8.0, 6
 FIT = "share that the URDF does not explain"
 DELAY, DRIFT, SATURATED = "delay [ms]", "clock drift [%]", "saturated samples"
 NEXT = "distance of the input from the next q"
+SLOPE = "dq/dt over v"
+TEST_RUN = 3  # of six runs, drawn by the seed 0
 OUTSIDE = "test outside"  # true of random motions, and no fault
 VISCOUS, DRY = np.array([0.3, 0.3, 0.1]), np.array([0.5, 0.5, 0.15])
 
@@ -29,23 +34,23 @@ def batch(*values):
     return np.array(values, dtype=float)[None]
 
 
-def arm(base=None):
-    """An arm on axes along z, y and x, whose base may be turned."""
+def arm(base=None, load=0.0):
+    """An arm on axes along z, y and x, whose base may be turned, with a load in its last body."""
     moments = [np.diag(x) for x in ([0.02, 0.02, 0.01], [0.004, 0.02, 0.02], [0.006, 0.006, 0.002])]
     return Arms(
         R=batch(np.eye(3) if base is None else base, np.eye(3), np.eye(3)),
         p=batch([0, 0, 0.2], [0, 0.05, 0.3], [0.3, 0, 0]),
         axis=batch([0, 0, 1], [0, 1, 0], [1, 0, 0]),
-        mass=batch(2.0, 1.5, 0.8),
+        mass=batch(2.0, 1.5, 0.8 + load),
         centre=batch([0.02, 0, 0.1], [0.15, 0.02, 0.03], [0.05, 0.06, -0.12]),
         moments=batch(*moments),
         **dict.fromkeys(("armature", "viscous", "dry", "offset"), np.zeros((1, 3))),
     )
 
 
-def torques(q, v, a, *, base=None, armature=0.02, dry=1.0, spring=(0, 0, 0)):
+def torques(q, v, a, *, base=None, load=0.0, armature=0.02, dry=1.0, spring=(0, 0, 0)):
     """Torques of the arm and its drives, ``(T, 3)``."""
-    mass, bias = mass_and_bias(arm(base), q[:, None], v[:, None])
+    mass, bias = mass_and_bias(arm(base, load), q[:, None], v[:, None])
     rigid = np.einsum("tij,tj->ti", mass[:, 0], a) + bias[:, 0]
     return rigid + armature * a + VISCOUS * v + dry * DRY * np.tanh(v / 0.02) + q * spring
 
@@ -98,8 +103,26 @@ def times(factor, *names):
     return change
 
 
-def exchanged(table):
-    table[["u1", "u2"]] = table[["u2", "u1"]].to_numpy()
+def exchanged(*names):
+    """Exchange the columns of the first two joints."""
+
+    def change(table):
+        for name in names:
+            table[[f"{name}1", f"{name}2"]] = table[[f"{name}2", f"{name}1"]].to_numpy()
+
+    return change
+
+
+def from_the_middle(change, *names):
+    def edit(table):
+        half, columns = len(table) // 2, list(names)
+        table.loc[half:, columns] = change(table.loc[half:, columns])
+
+    return edit
+
+
+def stuck(values):
+    return 0 * values + values.iloc[0]
 
 
 def clock(rate):
@@ -139,24 +162,37 @@ def noisy(table):
         table[name] += 0.3 * table[name].std() * noise
 
 
-def findings(frames, structure=None, unit="Nm"):
-    """Texts of the check that are not ok, by the name of their measurement, and the check."""
+def log_of(frames, q_unit="rad", u_unit="Nm"):
     columns = next(iter(frames.values())).columns
     q, v, u = ([x for x in columns if x.startswith(name)] for name in "qvu")
-    source = LogSource(
+    return LogSource(
         name="planted",
         files=frames,
         time={"columns": "t", "unit": "s"},
-        q={"columns": q, "unit": "rad"},
-        v={"columns": v, "unit": "rad/s"} if v else None,
-        u={"columns": u, "unit": unit} if u else [],
+        q={"columns": q, "unit": q_unit},
+        v={"columns": v, "unit": f"{q_unit}/s"} if v else None,
+        u={"columns": u, "unit": u_unit} if u else [],
     )
-    result = check(source, structure=structure)
+
+
+def bad(measurements):
+    """Texts of the measurements that are not ok, by name."""
     texts = {}
-    for x in result.measurements:
+    for x in measurements:
         if x.verdict != "ok" and x.name != OUTSIDE:
             texts.setdefault(x.name, []).append(x.text)
-    return texts, result
+    return texts
+
+
+def findings(frames, structure=None, unit="Nm"):
+    """What the check finds, and the check."""
+    result = check(log_of(frames, u_unit=unit), structure=structure)
+    return bad(result.measurements), result
+
+
+def read(frames, *units):
+    """What the comparison of runs finds, without the rest of the check."""
+    return bad(log_of(frames, *units).measurements)
 
 
 WALL = Rotation.from_euler("y", 90, degrees=True).as_matrix()  # gravity along x of the base
@@ -166,11 +202,14 @@ PLANTED = {
     "all inputs late": (lambda: arm_runs(delay=0.03), False, DELAY, ["'u1'", "'u2'", "'u3'"]),
     "an input late": (lambda: arm_runs(delay=(0, 0.015, 0)), True, DELAY, ["'u2' acts"]),
     "torque reversed": (lambda: edited(times(-1, "u2")), False, INERTIA, ["'u2' seems"]),
-    "torques exchanged": (lambda: edited(exchanged), True, FIT, ["inputs of the joints joint0"]),
+    "torques exchanged": (
+        lambda: edited(exchanged("u")),
+        True,
+        FIT,
+        ["inputs of the joints joint0"],
+    ),
     "clock 2 %": (lambda: edited(clock(0.02)), False, DRIFT, ["'u1' drifts by 2 %", "too early"]),
     "drive saturates": (lambda: edited(commanded), False, SATURATED, ["'u2' is a command"]),
-    "half a turn": (lambda: edited(shifted(np.pi), [1]), False, RESIDUAL, ["run1"]),
-    "mNm": (lambda: edited(times(1e3, "u2"), [2]), False, RESIDUAL, ["run2", "another unit"]),
     "v late": (lambda: edited(late_velocity), False, "lag of v [ms]", ["30 ms behind"]),
     "next state": (lambda: edited(next_state), False, NEXT, ["'u1'", "'u2'", "'u3'"]),
     "joint reversed": (lambda: edited(times(-1, "q3", "v3", "u3")), True, FIT, ["joint2 turns"]),
@@ -195,6 +234,54 @@ def test_a_planted_fault_gets_its_word_and_no_other(fault):
     for word in words:
         assert any(word in x for x in texts[name]), texts
     assert result.delay is None or name == DELAY
+
+
+FORCES, MOTION = ("u1", "u2", "u3"), ("q1", "q2", "q3", "v1", "v2", "v3")
+UNKNOWN = "is it another payload"
+BAD_RUNS = {
+    # Fault of a run: change, and words about it by measurement.
+    "half a turn": (shifted(np.pi), {RESIDUAL: UNKNOWN}),
+    "mNm": (times(1e3, *FORCES), {RESIDUAL: "another unit"}),
+    "ten": (times(10, *FORCES), {RESIDUAL: "another unit"}),
+    "reversed": (times(-1, *FORCES), {RESIDUAL: "sign reversed"}),
+    "torques exchanged": (exchanged("u"), {RESIDUAL: "are they exchanged"}),
+    "joints exchanged": (exchanged(*"qvu"), {RESIDUAL: UNKNOWN}),
+    "stuck torque": (from_the_middle(stuck, "u2"), {RESIDUAL: "sensor stuck"}),
+    "degrees": (times(180 / np.pi, "v2"), {SLOPE: "0.0174"}),
+    "stuck angle": (from_the_middle(stuck, "q2"), {RESIDUAL: UNKNOWN, SLOPE: "'q2'"}),
+    "stuck speed": (from_the_middle(stuck, "v2"), {SLOPE: "columns 'q2' and 'v2'"}),
+    "motion reversed": (
+        from_the_middle(np.negative, *MOTION),
+        {RESIDUAL: UNKNOWN, "jumps and spikes": "row 400, column 'q"},
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_RUNS)
+def test_a_bad_run_gets_its_word_and_no_other(fault):
+    """A training run and the test run in turn."""
+    change, words = BAD_RUNS[fault]
+    k = (2, TEST_RUN)[list(BAD_RUNS).index(fault) % 2]
+    texts = read(edited(change, [k]))
+    assert texts.keys() == words.keys(), texts
+    for name, word in words.items():
+        assert all(f"run{k}" in text and word in text for text in texts[name]), texts
+
+
+def test_another_payload_is_named():
+    frames = {**arm_runs(), "run2": arm_runs(load=1.6)["run2"]}
+    assert "run run2 does not fit" in read(frames)[RESIDUAL][0]
+
+
+def test_v_reversed_after_the_first_half_of_each_run():
+    (text,) = read(edited(from_the_middle(np.negative, "v2")))[SLOPE]
+    assert "(4 to 8 s) and 5 more runs, columns 'q2' and 'v2': the derivative of q is -1" in text
+
+
+def test_two_runs_and_a_short_one_are_not_compared():
+    frames = edited(times(10, "u1"), [0])
+    short = {"run0": frames["run0"][:100], "run1": frames["run1"], "run3": frames["run3"]}
+    assert RESIDUAL not in read(short)
 
 
 def masses_wrong():
@@ -256,3 +343,81 @@ def test_a_clean_log_gets_no_word(kind):
     texts, result = findings(frames(), structure and structure(), unit)
     assert texts == {}
     assert result.delay is None
+
+
+def test_a_slow_run_with_dry_friction_is_good():
+    """A slide of 1.2 kg with 4 N of dry friction; one run has a tenth of the amplitude."""
+
+    def run(seed, size):
+        rng, t = np.random.default_rng(seed), np.arange(2000) / 250
+        sines = delayed_robots.sines(np.random.default_rng(seed), 1, size=size, highest=1.0)
+        q, v, a = (sines(t, order) for order in range(3))
+        u = 1.2 * (a + 9.81) + 4 * np.tanh(1e3 * v)
+        return frame(t, q, u + 0.05 * rng.normal(size=u.shape), v)
+
+    assert read({f"r{k}": run(k, 0.004 if k == 2 else 0.04) for k in range(RUNS)}, "m", "N") == {}
+
+
+def test_a_bad_run_of_a_robot_with_more_inputs_than_coordinates():
+    def run(seed):
+        t = np.arange(801) / 100
+        u, q = delayed_robots.sines(np.random.default_rng(seed), 3, size=1.0)(t), [np.zeros(2)]
+        for x in u[:-1]:
+            q.append(q[-1] + 0.01 * delayed_robots.tendons(q[-1], x))
+        return frame(t, np.array(q), u, np.gradient(np.array(q), 0.01, axis=0))
+
+    runs = {f"r{k}": run(k) for k in range(RUNS)}
+    assert read(runs, "rad", "rad") == {}
+    times(-1, *FORCES)(runs["r4"])
+    texts = read(runs, "rad", "rad")
+    assert texts.keys() == {RESIDUAL}
+    assert "run r4 does not fit" in texts[RESIDUAL][0]
+    assert "sign reversed" in texts[RESIDUAL][0]
+
+
+def pushed_backwards(runs, columns):
+    """Inputs that are said to push backwards if the columns are reversed."""
+    reverse = {name: x.assign(**{c: -x[c] for c in columns}) for name, x in runs.items()}
+    return [x.split("'")[1] for x in read(reverse)[INERTIA]]
+
+
+def closed_loop(seed, gravity=False):
+    """Motions of a chain of three bodies under PD control, ``(runs, T, 3)`` each."""
+    generator = np.random.default_rng(seed)
+    chain = RigidChain(random_chain(generator))
+    while chain.num_coordinates != 3:
+        chain = RigidChain(random_chain(generator))
+    reference = delayed_robots.sines(generator, 15, size=0.6, highest=1.0)
+    step, rows = 0.005, []
+    q = torch.from_numpy(reference(0.0)).reshape(5, 3)
+    v = torch.from_numpy(reference(0.0, 1)).reshape(5, 3)
+    for k in range(2 * 801):
+        target, speed = (torch.from_numpy(reference(k * step, i)).reshape(5, 3) for i in (0, 1))
+        mass, bias = chain.mass_and_bias(q, v)
+        if k % 2 == 0:  # 100 Hz
+            gains = mass.diagonal(dim1=1, dim2=2)
+            u = gains * (100 * (target - q) + 15 * (speed - v))
+            u = u + chain.rigid_force(q, 0 * v, 0 * v) if gravity else u
+            rows.append(torch.stack([q, v, u]))
+        friction = gains * (0.5 * v + 0.5 * torch.tanh(10 * v))
+        v = v + step * torch.linalg.solve(mass, (u - bias - friction).unsqueeze(-1)).squeeze(-1)
+        q = q + step * v
+    motions = torch.stack(rows, dim=2).numpy()
+    t = np.arange(801) / 100
+    return {f"r{k}": frame(t, q, u, v) for k, (q, v, u) in enumerate(motions.swapaxes(0, 1))}
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+def test_signs_of_an_arm_under_a_controller(gravity):
+    runs = closed_loop(3 if gravity else 2, gravity)
+    assert read(runs) == {}
+    for names in (["u1", "u2", "u3"], ["u2"]):
+        assert pushed_backwards(runs, names) == names
+
+
+@pytest.mark.parametrize("robot", [PENDUBOT, ACROBOT], ids=["pendubot", "acrobot"])
+def test_sign_of_an_underactuated_robot(robot):
+    frames = underactuated.log(robot, 5).rename(columns={"u": "u1"}).groupby("run")
+    runs = {f"r{k}": frame.drop(columns="run") for k, (_, frame) in enumerate(frames)}
+    assert read(runs) == {}
+    assert pushed_backwards(runs, ["u1"]) == ["u1"]
