@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from pinn_dyn.data.logs import LogError
 from tests.attacks.damage import byte_hits, hit, places
-from tests.attacks.formats import FORMATS, formatted
+from tests.attacks.formats import DAMAGED, formatted
+from tests.data.log_formats import FORMATS
 from tests.data.logs_files import motion, source
 
 COLUMNS = ["t", "q1", "v1", "u1", "q2", "v2", "u2"]
@@ -158,7 +159,7 @@ def test_a_damaged_table_is_refused_or_read_as_it_is(tmp_path_factory, edits):
         np.testing.assert_allclose(found, [expected[t] for t in raw.t], rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", DAMAGED)
 @given(byte_hits(1, 3))
 def test_a_damaged_file_is_refused_or_numbers(name, tmp_path_factory, hits):
     folder = tmp_path_factory.mktemp("log")

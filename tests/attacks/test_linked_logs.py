@@ -1,16 +1,12 @@
 """HDF5 files that point to other files: nothing of them is read."""
 
-import json
-
 import h5py
 import numpy as np
 import pytest
 
 from pinn_dyn.data.logs import LogError
-from tests.attacks.formats import IN_LOG
 from tests.data import log_formats
-from tests.data.logs_files import motion, source
-from tests.data.test_log_formats import write_mat73
+from tests.data.logs_files import motion, named, source
 
 SECRET = np.linspace(0.0, 1.0, 501)
 
@@ -48,8 +44,8 @@ def linked(tmp_path, request):
 def test_values_of_other_files_are_refused(tmp_path, linked, suffix):
     path = tmp_path / f"run.{suffix}"
     dot = "/" if suffix == "h5" else "."
-    columns = json.loads(json.dumps(IN_LOG).replace("log/", f"log{dot}"))
-    (log_formats.write_hdf5 if suffix == "h5" else write_mat73)(path, motion(5.0))
+    columns = named(f"log{dot}{{}}_{{}}", f"log{dot}t")
+    (log_formats.write_hdf5 if suffix == "h5" else log_formats.write_mat73)(path, motion(5.0))
     linked(path)
     columns["u"] = dict(columns=[f"log{dot}far"], unit="Nm")
     with pytest.raises(LogError, match="log/far: values of other files"):
@@ -60,4 +56,4 @@ def test_values_of_other_files_that_are_not_needed_are_not_opened(tmp_path, link
     log_formats.write_hdf5(tmp_path / "run.h5", motion(5.0))
     linked(tmp_path / "run.h5")
     (tmp_path / "secret" / "file.h5").unlink()
-    assert source(tmp_path, files="run.h5", **IN_LOG).load().train
+    assert source(tmp_path, files="run.h5", **named("log/{}_{}", "log/t")).load().train

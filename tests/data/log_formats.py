@@ -1,12 +1,21 @@
 """The motion of the oscillator in every format, written without a robot's software."""
 
+import functools
+import gzip
+import json
+
 import h5py
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from scipy.io import savemat
+
+from tests.data.logs_files import arrays_of, named
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -86,17 +95,122 @@ def write_bag(path, table, *, version=2, mcap=True, late=0.0, empty_every=None, 
             writer.write(connection, stamp, serialize(message, connection.msgtype))
 
 
+def write_bag_file(path, table, **options):
+    """The file alone of a bag of ROS 2."""
+    folder = path.with_name("bag")
+    write_bag(folder, table, **options)
+    (file,) = folder.glob(f"*{path.suffix}")
+    file.rename(path)
+
+
 def write_hdf5(path, table):
     with h5py.File(path, "w") as file:
-        file["log/t"] = table["t"].to_numpy()
-        for name in "qvu":
-            file[f"log/{name}"] = table[[f"{name}1", f"{name}2"]].to_numpy()
+        for name, values in arrays_of(table).items():
+            file[f"log/{name}"] = values
         file["log/gains"] = np.eye(3)
 
 
+def write_compound(path, table):
+    """A data set of structures beside images of 180 GB, which are not loaded."""
+    rows = np.zeros(len(table), [("t", "f8"), *((name, "f8", 2) for name in "qvu"), ("mode", "S4")])
+    for name, values in arrays_of(table).items():
+        rows[name] = values
+    with h5py.File(path, "w") as file:
+        file["log"] = rows
+        file.create_dataset("images", (len(table), 9999, 9999, 3), "u1")
+
+
+def write_mat73(path, table):
+    """As MATLAB does: HDF5 behind a header of its own, matrices transposed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in arrays_of(table).items():
+            data = file.create_dataset(f"log/{name}", data=np.atleast_2d(values.T))
+            data.attrs["MATLAB_class"] = np.bytes_("double")
+        file["log"].attrs["MATLAB_class"] = np.bytes_("struct")
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    content = path.read_bytes()
+    path.write_bytes(head + content[len(head) :])
+
+
+def write_mat(path, table, *, packed=False):
+    arrays = arrays_of(table)
+    savemat(path, arrays | {"t": arrays["t"][:, None]}, do_compression=packed)
+
+
 def write_npz(path, table, **more):
-    signals = {name: table[[f"{name}1", f"{name}2"]].to_numpy() for name in "qvu"}
-    np.savez(path, t=table["t"].to_numpy(), **{**signals, **more})
+    np.savez(path, **arrays_of(table) | more)
+
+
+def write_nested_parquet(path, table):
+    """Structures, nested lists and an index."""
+    arrays = arrays_of(table)
+    frame = pd.DataFrame({"state": [{"q": {"a": x, "b": y}} for x, y in arrays["q"]]})
+    frame["u"] = [[[x], [y]] for x, y in arrays["u"]]
+    frame.set_axis(pd.Index(table["t"], name="t")).to_parquet(path)
+
+
+def tensors(table):
+    return {name: torch.tensor(x, requires_grad=True) for name, x in arrays_of(table).items()}
+
+
+def records(table):
+    """The rows as nested vectors."""
+    arrays = {name: x.tolist() for name, x in arrays_of(table).items()}
+    rows = zip(*(arrays[name] for name in "tqvu"), strict=True)
+    return [{"t": t, "state": {"q": q}, "v": v, "u": u} for t, q, v, u in rows]
+
+
+def json_arrays(table):
+    arrays = {name: x.tolist() for name, x in arrays_of(table).items()}
+    return {**arrays, "state": {"q": arrays.pop("q")}}
+
+
+def write_json(path, table, *, form):
+    content = form(table)
+    lines = map(json.dumps, content) if path.suffix == ".jsonl" else [json.dumps(content)]
+    path.write_text("\n".join(lines))
+
+
+VECTORS = named("{}_{}")
+NUMBERS = {
+    name: dict(columns=[str(k) for k in places], unit=unit)
+    for name, places, unit in (("q", (1, 4), "rad"), ("v", (2, 5), "rad/s"), ("u", (3, 6), "Nm"))
+} | {"time": dict(columns="0", unit="s")}
+NESTED = VECTORS | {"q": dict(columns=["state.q_1", "state.q_2"], unit="rad")}
+STRUCTS = {"q": dict(columns=["state.q.a", "state.q.b"], unit="rad"), "v": None}
+FORMATS = {
+    # Ending: function that writes a table to a path, and the columns of the source.
+    "csv.gz": (lambda path, table: path.write_bytes(gzip.compress(table.to_csv().encode())), {}),
+    "npz": (write_npz, VECTORS),
+    "npy": (lambda path, table: np.save(path, table.to_numpy()), NUMBERS),
+    "structured.npy": (lambda path, table: np.save(path, table.to_records(index=False)), {}),
+    "pt": (lambda path, table: torch.save(tensors(table), path), VECTORS),
+    "nested.pt": (
+        lambda path, table: torch.save({"log": tensors(table)}, path),
+        named("log.{}_{}", "log.t"),
+    ),
+    "matrix.pt": (lambda path, table: torch.save(torch.tensor(table.to_numpy()), path), NUMBERS),
+    "mat": (write_mat, VECTORS),
+    "packed.mat": (functools.partial(write_mat, packed=True), VECTORS),
+    "73.mat": (write_mat73, named("log.{}_{}", "log.t")),
+    "hdf.mat": (write_hdf5, named("log/{}_{}", "log/t")),
+    "h5": (write_hdf5, named("log/{}_{}", "log/t")),
+    "compound.h5": (write_compound, named("log/{}_{}", "log/t")),
+    "parquet": (lambda path, table: table.to_parquet(path), {}),
+    "nested.parquet": (write_nested_parquet, VECTORS | STRUCTS),
+    "json": (functools.partial(write_json, form=json_arrays), NESTED),
+    "records.json": (
+        lambda path, table: table.to_json(path, orient="records", double_precision=15),
+        {},
+    ),
+    "vectors.json": (functools.partial(write_json, form=records), NESTED),
+    "jsonl": (functools.partial(write_json, form=records), NESTED),
+    "mcap": (write_bag_file, BAG),
+    "gripper.mcap": (functools.partial(write_bag_file, empty_every=7), BAG),
+    "db3": (functools.partial(write_bag_file, mcap=False), BAG),
+    "bag": (functools.partial(write_bag, version=1), BAG),
+}
+"""Of gripper.mcap another node publishes on the topic, without velocities."""
 
 
 def write_lerobot(folder, table, episodes=3):

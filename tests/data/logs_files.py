@@ -45,6 +45,36 @@ def source(folder, **changes):
     return LogSource(**{**arguments, **changes})
 
 
+def named(pattern, time=None):
+    """Columns of a source whose names follow a pattern of the signal and its number."""
+    units = {"q": "rad", "v": "rad/s", "u": "Nm"}
+    columns = {
+        key: dict(columns=[pattern.format(key, k) for k in (1, 2)], unit=unit)
+        for key, unit in units.items()
+    }
+    return columns if time is None else columns | {"time": dict(columns=time, unit="s")}
+
+
+def arrays_of(table):
+    """The signals of a table, ``(T,)`` and ``(T, 2)``."""
+    pairs = {name: table[[f"{name}1", f"{name}2"]].to_numpy() for name in "qvu"}
+    return {"t": table["t"].to_numpy()} | pairs
+
+
+def assert_read(log, table, count=1):
+    """Most rows of a table, in so many runs, are the recordings of a source without steps."""
+    parts = [part.raw for part in log.cleaned]
+    assert len({part.run for part in parts}) == count
+    assert sum(map(len, parts)) > 0.7 * count * len(table)
+    arrays = arrays_of(table)
+    for part in parts:
+        rows = np.round(RATE * part.t).astype(int)
+        for name in "tqvu":
+            values = getattr(part, name)
+            if values is not None:
+                np.testing.assert_allclose(values, arrays[name][rows], atol=1e-7)
+
+
 def recording(q, *, t=None, v=None, u=None, rate=RATE):
     """A recording of given columns; the input is random where none is given."""
     q = np.asarray(q, dtype=float).reshape(len(q), -1)

@@ -144,6 +144,7 @@ def test_a_long_rest_before_a_jump_is_a_motion(count, left_out):
     q = 5.0 + np.sin(0.1 * np.arange(100))[:, None]
     q[:count] = 0.0
     assert rows_before_first_sample(q) == left_out
+    assert rows_before_first_sample(q[:1]) == 0  # of a run that ends at once
 
 
 def gaps(rng, bursts):

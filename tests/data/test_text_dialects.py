@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pinn_dyn.data.logs import LogError
-from tests.data.logs_files import motion, source
+from tests.data.logs_files import arrays_of, assert_read, motion, named, source
 
 TABLE = motion(6.0).round(9)
 NAMES = TABLE.columns.tolist()
@@ -50,14 +50,6 @@ def by_number(start, names=NAMES):
         v=dict(columns=[place["v1"], place["v2"]], unit="rad/s"),
         u=dict(columns=[place["u1"], place["u2"]], unit="Nm"),
     )
-
-
-def named(pattern):
-    """Columns of the source whose names follow a pattern of the signal and its number."""
-    return {
-        key: dict(columns=[pattern.format(key, k) for k in (1, 2)], unit=unit)
-        for key, unit in (("q", "rad"), ("v", "rad/s"), ("u", "Nm"))
-    }
 
 
 VECTORS = named("{}_{}")
@@ -284,29 +276,10 @@ def test_the_separator_may_be_named(tmp_path):
         loaded(tmp_path, text, sep=",")
 
 
-@pytest.mark.parametrize("kind", ["npy", "structured", "pt", "nested", "runs", "matrix"])
-def test_files_of_arrays(tmp_path, kind):
-    arrays = {name: TABLE[[f"{name}1", f"{name}2"]].to_numpy() for name in "qvu"}
-    tensors = {"t": torch.tensor(TABLE["t"].to_numpy())}
-    tensors |= {name: torch.tensor(x, requires_grad=True) for name, x in arrays.items()}
-    columns = VECTORS
-    if kind in ("npy", "structured"):
-        table = TABLE.to_records(index=False) if kind == "structured" else np.array(ROWS)
-        np.save(tmp_path / "run.npy", np.asarray(table))
-        columns = by_number(0) if kind == "npy" else {}
-    else:
-        content = {"pt": tensors, "nested": {"log": tensors}, "runs": [tensors, tensors]}
-        torch.save(content.get(kind, torch.tensor(ROWS)), tmp_path / "run.pt")
-        columns = by_number(0) if kind == "matrix" else VECTORS
-        if kind == "nested":
-            columns = named("log.{}_{}") | {"time": dict(columns="log.t", unit="s")}
-    log = source(tmp_path, files="run.*", **columns)
-    log.load()
-    raws = {part.raw.run: part.raw for part in log.cleaned if part.split == "train"}
-    assert len(raws) == (2 if kind == "runs" else 1)
-    raw = next(iter(raws.values()))
-    np.testing.assert_allclose(raw.q, arrays["q"][: len(raw)], atol=1e-6)
-    np.testing.assert_allclose(raw.u, arrays["u"][: len(raw)], atol=1e-6)
+def test_a_list_of_tensors_holds_runs(tmp_path):
+    tensors = {name: torch.tensor(x) for name, x in arrays_of(TABLE).items()}
+    torch.save([tensors, tensors], tmp_path / "run.pt")
+    assert_read(source(tmp_path, files="run.pt", **VECTORS), TABLE, count=2)
 
 
 def test_python_objects_are_refused_and_the_advice_works(tmp_path):

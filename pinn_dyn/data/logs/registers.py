@@ -52,7 +52,9 @@ def rows_before_first_sample(q: np.ndarray) -> int:
     """
     steps = np.abs(np.diff(q, axis=0))
     moving = steps.any(axis=1)
+    if not moving.any():
+        return 0
     first = int(moving.argmax())
     later = steps[first + 1 :].max(axis=0, initial=0.0)
-    jumps = moving.any() and (steps[first] > _FIRST_STEP * later)[later > 0].any()
+    jumps = (steps[first] > _FIRST_STEP * later)[later > 0].any()
     return first + 1 if jumps and first + 1 < _FEW * len(q) else 0
