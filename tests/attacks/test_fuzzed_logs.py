@@ -118,14 +118,18 @@ def read(source_of):
 
 
 def rows_of(content):
-    """The numbers of a text by their time: each line below the header by Python's own reader."""
+    """The numbers of a text by their time: each line below the header by Python's own reader.
+
+    Of several headers the last one counts.
+    """
     found, names, separator = {}, [], ","
     for line in re.split("[\r\n]+", content):
         if not set(COLUMNS) <= set(names):
             separator = max(",;\t |", key=line.count)
         row = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-        if not set(COLUMNS) <= set(names):
-            names = [name.strip() for name in row]
+        titles = [name.strip() for name in row]
+        if not set(COLUMNS) <= set(names) or (not found and set(COLUMNS) <= set(titles)):
+            names = titles
             continue
         values = dict(zip(names, row, strict=False))
         with contextlib.suppress(KeyError, ValueError):  # lines that hold no row
