@@ -49,6 +49,12 @@ def test_each_spring_is_between_a_link_and_its_motor():
         assert_near(x @ matrix, model.elastic.forces(*at) @ model.elastic.stretch, 1e-9)
 
 
+def test_units_of_springs_are_those_of_their_joints():
+    springs = elastic_model(joints=("bend", "slide")).elastic
+    assert list(springs.stiffness.named().units) == ["Nm/rad", "N/m"]
+    assert list(springs.damping.named().units) == ["Nms/rad", "Ns/m"]
+
+
 ARM = robot(
     link("base"),
     link("upper", 2.0),

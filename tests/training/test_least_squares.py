@@ -137,6 +137,9 @@ def test_a_fit_that_knew_much_for_certain_can_be_started_from(runs):
     x = torch.linalg.cholesky(known)
     lengths = (root[:, held] @ x).norm(dim=0)
     torch.testing.assert_close(lengths, torch.ones_like(lengths), rtol=1e-3, atol=0)
+    # A heavy load is five standard deviations of the usual prior.
+    free = root[:, ~held].norm(dim=0)
+    torch.testing.assert_close(free, torch.full_like(free, 1 / 5), rtol=1e-9, atol=0)
 
 
 def test_the_information_is_that_of_the_inputs_that_are_missed(truth, runs):
