@@ -2,6 +2,7 @@
 
 import ctypes
 import itertools
+import mmap
 import operator
 
 import numpy as np
@@ -13,6 +14,7 @@ from pinn_dyn.exports.exported import ExportedFunction, write
 from pinn_dyn.exports.scalar_code import Terms
 from pinn_dyn.testing import LinearSystem
 from tests.support.c_code import compiled
+from tests.support.processes import fork
 
 VALUES = {"x": 0.7, "y": -1.3, "yes": True, "no": False}
 RULES = {
@@ -100,3 +102,28 @@ def test_operations_in_vectors_are_those_of_pytorch_also_of_nan(monkeypatch, tmp
         loop = Loop(*loop_code(programs, several))
         found = loop(0 * x, x, inputs, h)[:, 0]
         torch.testing.assert_close(found, end, rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+def at_the_end_of_a_page(values):
+    """A copy of a tensor behind which nothing can be read."""
+    size = values.numel() * values.element_size()
+    length = -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
+    memory = mmap.mmap(-1, length + mmap.PAGESIZE)
+    address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    page = ctypes.c_void_p(address + length), ctypes.c_size_t(mmap.PAGESIZE)
+    assert ctypes.CDLL(None).mprotect(*page, 0) == 0
+    copy = torch.frombuffer(memory, dtype=values.dtype, count=values.numel(), offset=length - size)
+    return copy.copy_(values.flatten()).reshape(values.shape)
+
+
+def test_lanes_without_a_trajectory_read_nothing(monkeypatch, tmp_path):
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
+    model = LinearSystem([[1.0]], [[1.0]], [[0.1]], [[1.0]]).double()
+    inputs = torch.ones(5, 3, len(model.integrator.nodes), 1).double()
+    x, h = torch.ones(5, 2).double(), torch.full((3,), 0.1).double()
+    loop = Loop(*loop_code(traced(model, x[0], inputs[0, 0], h[0]), several=True))
+    guarded = [at_the_end_of_a_page(values) for values in (0 * x, x, inputs, h)]
+    with (tmp_path / "output.txt").open("w") as output:
+        process = fork(lambda: loop(*guarded), output)
+        process.join(60)
+    assert process.exitcode == 0
