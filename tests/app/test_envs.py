@@ -255,12 +255,12 @@ def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
     is_over = np.zeros(3, dtype=bool)
     single.reset()
     for _ in range(2 * env.steps + 1):
-        actions, before = env.action_space.sample(), observations
+        actions, before = 2 * env.action_space.sample(), observations  # beyond the limits
         observations, rewards, terminated, truncated, _ = env.step(actions)
         for k in range(3):
             if is_over[k]:  # the action has no effect, and a new episode starts
                 assert rewards[k] == 0
-                assert (observations[k] != before[k]).any()
+                assert (observations[k] != before[k]).reshape(3, -1).any(1).all()  # q, v, goal
                 continue
             q, v, single._goal = np.split(before[k], 3)
             single.plant.start(torch.from_numpy(q[None]), torch.from_numpy(v[None]))
