@@ -185,7 +185,7 @@ class Ends(Callback):
     """Notes where each training step of Lightning ends."""
 
     def __init__(self):
-        self.steps, self.batches = [], []
+        self.steps, self.batches, self.progress = [], [], []
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
         self.steps.append(trainer.global_step)
@@ -196,7 +196,13 @@ def trained(tmp_path, data, monkeypatch, seconds, **options):
     monkeypatch.setattr("pinn_dyn.training.learner.BLOCK_SECONDS", seconds)
     torch.manual_seed(0)
     learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
-    ends = Ends()
+    ends, selected = Ends(), learner.loss.selected
+
+    def noted(windows, progress):
+        ends.progress.append(progress)
+        return selected(windows, progress)
+
+    monkeypatch.setattr(learner.loss, "selected", noted)
     options = {"log_every_n_steps": 20, "enable_checkpointing": False, **options}
     trainer = make_trainer(tmp_path, max_epochs=2, callbacks=[ends], **options)
     trainer.fit(learner, LightningData(data))
@@ -211,6 +217,7 @@ def test_many_steps_in_one_are_the_same_training(tmp_path, data, monkeypatch):
     assert ends.batches == [1, 19, 20, 30, 9, 10, 29, 30]
     alone, each, other = trained(tmp_path, data, monkeypatch, 0.0)
     assert each.steps == list(range(1, 61))
+    assert ends.progress == each.progress == [step / 60 for step in range(60)]
     assert trainer.global_step == other.global_step == 60
     assert trainer.callback_metrics["train/loss"] == other.callback_metrics["train/loss"]
     for one, two in zip(together, alone, strict=True):
