@@ -15,8 +15,8 @@ from pinn_dyn.control import (
     export_law,
 )
 from pinn_dyn.control.contracts import Plant
-from pinn_dyn.testing import LinearSystem
 from tests.support.c_code import function_of
+from tests.support.linear import Pendulums
 
 RATE, PIECES = 100.0, 10
 MASS = np.array([[0.5, 0.1], [0.1, 0.2]])
@@ -26,16 +26,6 @@ GRAVITY, DAMPING, INPUTS = (
     np.array([[1.0, 0], [0.2, 0.9]]),
 )
 REFERENCE = Sines([0.2, -0.1], [0.8, 0.6], [0.9, 1.3], rise_time=0.5)
-
-
-class Pendulums(LinearSystem):
-    """Two coupled pendulums: M a + D v + K sin q = A u."""
-
-    def potential_energy(self, q):
-        return -(self.stiffness.diagonal() * q.cos()).sum(-1)
-
-    def _potential_force(self, q):
-        return self.stiffness.diagonal() * q.sin()
 
 
 class LatePendulums(Plant):

@@ -16,44 +16,28 @@ from pinn_dyn.control import (
     close_loop,
     close_loop_continuous,
 )
-from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.testing.linear_system import damped_oscillators
-from tests.support.linear import double
+from tests.support.linear import Pendulums, double
 
 pytest.importorskip("casadi")
 STEP = 0.05
 
 
-class Pendulum(MechanicalSystem):
+def pendulum(mass=1.0, kind=Pendulums):
     """A point mass on a rod of 0.5 m, driven by a motor; q = 0 hangs."""
-
-    def __init__(self, mass=1.0):
-        super().__init__(num_coordinates=1, num_inputs=1)
-        self.mass = mass
-
-    def mass_matrix(self, q):
-        return torch.full_like(q, self.mass / 4).unsqueeze(-1)
-
-    def potential_energy(self, q):
-        return -9.81 * self.mass / 2 * torch.cos(q[..., 0])
-
-    def damping_matrix(self, q):
-        return torch.full_like(q, 0.1).unsqueeze(-1)
-
-    def input_matrix(self, q):
-        return torch.ones_like(q).unsqueeze(-1)
+    return kind([[mass / 4]], [[9.81 * mass / 2]], [[0.1]], [[1.0]])
 
 
 def run(law, reference=None, *, q0=0.0, v0=0.0, duration=1.0, mass=1.0, actuator=None):
     reference = reference or SetPoint([1.0])
     start = double([[q0]]), double([[v0]])
     arguments = {"duration": duration, "rate": 1 / STEP, "actuator": actuator}
-    return close_loop(SystemPlant(Pendulum(mass)), law, reference, *start, **arguments)
+    return close_loop(SystemPlant(pendulum(mass)), law, reference, *start, **arguments)
 
 
 @pytest.fixture(scope="module")
 def law():
-    return PredictiveControl(Pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
+    return PredictiveControl(pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
 
 
 def linear_problem(steps, Q, R):
@@ -99,8 +83,8 @@ def test_with_limits_it_is_the_bounded_least_squares_solution():
 def test_it_respects_the_limits_and_beats_the_clipped_law():
     actuator = Actuator(-6.0, 6.0, rate=60.0)
     settings = {"input_weight": 1e-3, "velocity_weight": 0.01, "v_max": 2.0, "actuator": actuator}
-    planned = run(PredictiveControl(Pendulum(), 0.6, STEP, **settings), duration=1.5)
-    clipped = run(Regulation(Pendulum(), 20.0, 1.0), duration=1.5, actuator=actuator)
+    planned = run(PredictiveControl(pendulum(), 0.6, STEP, **settings), duration=1.5)
+    clipped = run(Regulation(pendulum(), 20.0, 1.0), duration=1.5, actuator=actuator)
     assert planned.u.abs().max() <= 6.0
     assert planned.u.diff(dim=1).abs().max() <= 60.0 * STEP + 1e-6
     assert planned.u[0, 0].abs() <= 60.0 * STEP + 1e-6  # from zero
@@ -113,17 +97,17 @@ def test_it_respects_the_limits_and_beats_the_clipped_law():
 def test_limits_hold_on_both_sides_and_at_a_rate_above_that_of_the_plan():
     actuator = Actuator(-6.0, 6.0, rate=60.0)
     settings = {"velocity_weight": 0.01, "q_low": -0.8, "v_max": 2.0, "actuator": actuator}
-    law = PredictiveControl(Pendulum(), 0.6, STEP, **settings)
+    law = PredictiveControl(pendulum(), 0.6, STEP, **settings)
     start = double([[0.0]]), double([[0.0]])
     loop = {"duration": 1.0, "rate": 2 / STEP}
-    record = close_loop(SystemPlant(Pendulum()), law, SetPoint([-1.0]), *start, **loop)
+    record = close_loop(SystemPlant(pendulum()), law, SetPoint([-1.0]), *start, **loop)
     assert not record.diagnostics["solver_failed"].any()
     assert record.u.diff(dim=1).abs().max() <= 60.0 * STEP / 2 + 1e-6
     assert -2.05 < record.v.min() < -1.8
     assert -0.81 < record.q.min() < -0.79
 
 
-class Rough(Pendulum):
+class Rough(Pendulums):
     """A pendulum with smooth Coulomb friction."""
 
     def _friction_force(self, v):
@@ -133,10 +117,10 @@ class Rough(Pendulum):
 def test_a_set_point_beyond_a_limit_is_approached_up_to_the_limit(caplog):
     """Plans that weigh the goal against the limit fail, and leave the limit."""
     settings = {"velocity_weight": 0.01, "q_high": 0.3, "actuator": Actuator(-6.0, 6.0)}
-    law = PredictiveControl(Rough(), 0.8, STEP, **settings)
+    law = PredictiveControl(pendulum(kind=Rough), 0.8, STEP, **settings)
     start = double([[0.0]]), double([[0.0]])
     record = close_loop(
-        SystemPlant(Rough()), law, SetPoint([1.0]), *start, duration=1.0, rate=1 / STEP
+        SystemPlant(pendulum(kind=Rough)), law, SetPoint([1.0]), *start, duration=1.0, rate=1 / STEP
     )
     assert not record.diagnostics["solver_failed"].any()
     assert 0.29 < record.q[0, -1] <= record.q.max() < 0.301
@@ -151,7 +135,7 @@ def test_a_new_run_forgets_the_previous_run(law):
 def test_it_sees_the_reference_ahead_of_time(law):
     move = PointToPoint([0.0], [1.5], duration=0.5, begin=0.3)
     ahead = run(law, move)
-    law_without = PredictiveControl(Pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
+    law_without = PredictiveControl(pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
     law_without.follow = lambda reference: None
     errors = [(x.q - x.reference.q).abs().max() for x in (ahead, run(law_without, move))]
     assert errors[0] < 0.5 * errors[1]
@@ -160,7 +144,7 @@ def test_it_sees_the_reference_ahead_of_time(law):
 def test_the_observer_removes_the_steady_error_of_a_wrong_model(law):
     wrong, exact = run(law, mass=1.2, duration=2.0), run(law)
     observed = PredictiveControl(
-        Pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01, observer_bandwidth=10.0
+        pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01, observer_bandwidth=10.0
     )
     corrected = run(observed, mass=1.2, duration=2.0)
     assert (corrected.q - 1)[0, -1].abs() < 1e-3 < 0.02 < (wrong.q - 1)[0, -1].abs()
@@ -188,7 +172,7 @@ def test_a_failed_solver_holds_the_last_input_and_stops_after_a_horizon(law, mon
 
 def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
     settings = {"q_high": 0.5, "actuator": Actuator(-6.0, 6.0)}
-    law = PredictiveControl(Pendulum(), 0.6, STEP, **settings)
+    law = PredictiveControl(pendulum(), 0.6, STEP, **settings)
     with pytest.raises(ValueError, match=r"no feasible plan: q\[0\] of run 0 starts at 0.8"):
         run(law, SetPoint([0.2]), q0=0.8)
     run(law, SetPoint([0.2]), duration=2 * STEP)
@@ -196,7 +180,7 @@ def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
     run(law, SetPoint([0.2]), q0=0.3, v0=6.0, duration=2 * STEP)
     assert "leaves the limits of q[0]" in caplog.text
     caplog.clear()
-    law = PredictiveControl(Pendulum(), 0.6, STEP, q_low=-0.5, actuator=Actuator(-6.0, 6.0))
+    law = PredictiveControl(pendulum(), 0.6, STEP, q_low=-0.5, actuator=Actuator(-6.0, 6.0))
     run(law, SetPoint([-0.2]), q0=-0.3, v0=-6.0, duration=2 * STEP)
     assert "leaves the limits of q[0]" in caplog.text
 
@@ -205,13 +189,13 @@ def test_continuous_time_is_refused(law):
     start = double([[0.0]]), double([[0.0]])
     settings = {"duration": 0.2, "samples_rate": 20.0}
     with pytest.raises(ValueError, match="set a rate"):
-        close_loop_continuous(Pendulum(), law, SetPoint([1.0]), *start, **settings)
+        close_loop_continuous(pendulum(), law, SetPoint([1.0]), *start, **settings)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("k", [0, 1])
 def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
-    law = PredictiveControl(Pendulum(), 0.6, STEP, observer_bandwidth=5.0)
+    law = PredictiveControl(pendulum(), 0.6, STEP, observer_bandwidth=5.0)
     goal = SetPoint([1.0])(0.0)
     states = [double([[0.1]]), double([[0.0]])]
     first = law(0.0, *states, goal)
@@ -226,7 +210,7 @@ def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
 
 
 def test_times_limits_and_references_that_are_not_numbers_are_named():
-    law = PredictiveControl(Pendulum(), 0.6, STEP)
+    law = PredictiveControl(pendulum(), 0.6, STEP)
     state, goal = [double([[0.1]]), double([[0.0]])], SetPoint([1.0])(0.0)
     with pytest.raises(ValueError, match="t is nan, expected the time of the call in s"):
         law(np.nan, *state, goal)
@@ -234,7 +218,7 @@ def test_times_limits_and_references_that_are_not_numbers_are_named():
         law(0.0, *state, goal._replace(v=double([np.nan])))
     for name in ("q_low", "v_max", "position_weight"):
         with pytest.raises(ValueError, match=rf"{name} is nan, expected 1 or 1 numbers"):
-            PredictiveControl(Pendulum(), 0.6, STEP, **{name: np.nan})
+            PredictiveControl(pendulum(), 0.6, STEP, **{name: np.nan})
     with pytest.raises(ValueError, match="low nan and high None, expected low <= high"):
         Actuator(low=np.nan)
     law.reset()
@@ -242,8 +226,8 @@ def test_times_limits_and_references_that_are_not_numbers_are_named():
 
 def test_values_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match="v_max is"):
-        PredictiveControl(Pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
+        PredictiveControl(pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
     with pytest.raises(ValueError, match="expected two steps"):
-        PredictiveControl(Pendulum(), 0.05, STEP)
+        PredictiveControl(pendulum(), 0.05, STEP)
     with pytest.raises(ValueError, match=r"q_low\[0\] is 1, which exceeds q_high\[0\], 0.5"):
-        PredictiveControl(Pendulum(), 0.6, STEP, q_low=1.0, q_high=0.5)
+        PredictiveControl(pendulum(), 0.6, STEP, q_low=1.0, q_high=0.5)

@@ -2,37 +2,20 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from pinn_dyn.evaluation import torque_error
 from pinn_dyn.evaluation.torque import part_shares, residual_share
-from pinn_dyn.mechanics import MechanicalSystem, Signal, Sum, Trajectory
+from pinn_dyn.mechanics import Signal, Sum, Trajectory
+from tests.support.linear import Pendulums
 
 
-class Pendulum(MechanicalSystem):
-    """m a + d v + k sin q = u for each of two joints; the second has no motor if told so."""
-
-    def __init__(self, mass=2.0, damping=0.5, stiffness=3.0, motors=2, factor=1.0):
-        super().__init__(2, motors)
-        self.mass, self.damping, self.stiffness = mass, damping, stiffness
-        self.factor = factor
-        self.anchor = torch.nn.Parameter(torch.zeros(()))
-
-    def mass_matrix(self, q):
-        eye = torch.eye(2, dtype=q.dtype).expand(*q.shape[:-1], 2, 2)
-        return self.factor * self.mass * eye + self.anchor * eye
-
-    def potential_energy(self, q):
-        return -self.factor * self.stiffness * torch.cos(q).sum(-1)
-
-    def damping_matrix(self, q):
-        eye = torch.eye(2, dtype=q.dtype).expand(*q.shape[:-1], 2, 2)
-        return self.factor * self.damping * eye
-
-    def input_matrix(self, q):
-        eye = torch.eye(2, self.num_inputs, dtype=q.dtype)
-        return self.factor * eye.expand(*q.shape[:-1], 2, self.num_inputs)
+def pendulum(damping=0.5, motors=2, factor=1.0, kind=Pendulums):
+    """2 a + d v + 3 sin q = u for each of two joints; the second has no motor if told so."""
+    terms = (np.eye(2) * factor * x for x in (2.0, 3.0, damping))
+    return kind(*terms, factor * np.eye(2)[:, :motors])
 
 
 def motion(motors=2, step=0.01):
@@ -47,15 +30,15 @@ def motion(motors=2, step=0.01):
 
 def test_the_true_model_has_no_torque_error():
     truth, _, _ = motion()
-    found = torque_error(Pendulum(), truth, system=Pendulum())
+    found = torque_error(pendulum(), truth, system=pendulum())
     assert found.mean < 1e-9
     assert found.share < 1e-9
 
 
 def test_a_wrong_damping_errs_by_its_share_of_the_velocity():
     truth, v, u = motion()
-    for system, tolerance in ((Pendulum(), 1e-6), (None, 2e-3)):  # the slope of v by a polynomial
-        found = torque_error(Pendulum(damping=0.7), truth, system=system)
+    for system, tolerance in ((pendulum(), 1e-6), (None, 2e-3)):  # the slope of v by a polynomial
+        found = torque_error(pendulum(damping=0.7), truth, system=system)
         rms = 0.2 * v.square().mean(0).sqrt()
         torch.testing.assert_close(found.rms, rms, rtol=tolerance, atol=tolerance)
         spread = u.std(dim=0, correction=0)
@@ -67,13 +50,13 @@ def test_a_wrong_damping_errs_by_its_share_of_the_velocity():
 def test_a_common_factor_of_all_terms_does_not_change_the_share():
     truth, _, _ = motion()
     one, ten = (
-        torque_error(Pendulum(damping=0.7, factor=f), truth, system=Pendulum()) for f in (1, 10)
+        torque_error(pendulum(damping=0.7, factor=f), truth, system=pendulum()) for f in (1, 10)
     )
     assert ten.share == pytest.approx(one.share, rel=1e-9)
     assert ten.mean == pytest.approx(10 * one.mean, rel=1e-9)
 
 
-class Leaky(Pendulum):
+class Leaky(Pendulums):
     """Pendulum with the residual force 0.4 v."""
 
     has_residual = True
@@ -86,13 +69,13 @@ def test_the_residual_share_is_relative_to_both_forces():
     truth, v, u = motion()
     residual, applied = (x.square().sum(-1).mean().sqrt() for x in (0.4 * v, u))
     expected = float(residual / (residual + applied))
-    assert residual_share(Leaky(), truth) == pytest.approx(expected, rel=1e-6)
+    assert residual_share(pendulum(kind=Leaky), truth) == pytest.approx(expected, rel=1e-6)
 
 
 def test_each_part_of_a_sum_has_its_share_of_each_term():
     """Three times the mass, damping and stiffness make three quarters of the force."""
     truth, v, _ = motion()
-    parts = {"light": Pendulum(), "heavy": Pendulum(factor=3.0)}
+    parts = {"light": pendulum(), "heavy": pendulum(factor=3.0)}
     table = part_shares(Sum(parts), truth).set_index(["part", "term"])
     damping = float((0.5 * v).square().sum(-1).mean().sqrt())
     assert table.loc[("light", "D v + F"), "rms"] == pytest.approx(damping, rel=1e-6)
@@ -102,7 +85,7 @@ def test_each_part_of_a_sum_has_its_share_of_each_term():
 
 def test_a_joint_without_a_motor_has_no_share_but_counts():
     truth, _, _ = motion(motors=1)
-    found = torque_error(Pendulum(motors=1), truth, system=None)
+    found = torque_error(pendulum(motors=1), truth, system=None)
     frame = found.to_frame(["shoulder", "elbow"])
     assert frame["joint"].tolist() == ["shoulder", "elbow"]
     assert frame["torque_share"].isna().tolist() == [False, True]
@@ -115,7 +98,7 @@ def test_a_joint_without_a_motor_has_no_share_but_counts():
 def test_accelerations_need_samples_at_a_constant_step():
     truth, _, _ = motion()
     with pytest.raises(ValueError, match="3 samples"):
-        torque_error(Pendulum(), truth.until(0.02), system=None)
+        torque_error(pendulum(), truth.until(0.02), system=None)
     uneven = Trajectory(truth.q, truth.v, Signal(truth.t**2, truth.u))
     with pytest.raises(ValueError, match="accelerations need at least 5 at a constant step"):
-        torque_error(Pendulum(), uneven, system=None)
+        torque_error(pendulum(), uneven, system=None)

@@ -108,6 +108,8 @@ def test_no_trajectories_give_no_states(kind):
 
 def test_long_paths_are_computed_in_blocks_and_end_where_one_diverges(monkeypatch):
     monkeypatch.setattr(c_loop, "NUMBERS", 100)
+    found, expected = rolled_out(LinearSystem([[1.0]], [[9.0]], [[0.1]], [[1.0]]), (2,))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
     unstable = LinearSystem([[1.0]], [[-1e9]], [[0.0]], [[1.0]])
     found, expected = rolled_out(unstable, (2,), scale=1e300)
     assert not expected[:, -1].isfinite().any()

@@ -11,6 +11,16 @@ def double(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
+class Pendulums(LinearSystem):
+    """Coupled pendulums, M a + D v + K sin q = A u, with a diagonal K."""
+
+    def potential_energy(self, q):
+        return -(self.stiffness.diagonal() * q.cos()).sum(-1)
+
+    def _potential_force(self, q):
+        return self.stiffness.diagonal() * q.sin()
+
+
 def unit_masses(n):
     """n uncoupled unit masses on unit springs and dampers, each with its input: A = I."""
     return LinearSystem(np.eye(n), np.eye(n), np.eye(n), np.eye(n))
