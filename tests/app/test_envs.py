@@ -220,20 +220,23 @@ def draws_of(name):
 @pytest.mark.parametrize("name", ["chain", "lnn", "hnn", "wide"])
 @pytest.mark.parametrize("delay", [0.0, 0.003])
 def test_robots_with_other_constants_move_as_their_own_models(name, delay):
-    """Seven robots of three models, two of which start again, beside each robot alone."""
+    """Eleven robots of three models, two of which start again, beside some robots alone.
+
+    With eight lanes, the second thread has the robots from the ninth on.
+    """
     models = draws_of(name)
     n, m = models[0].num_coordinates, models[0].num_inputs
     settings = {"step": 0.005, "delay": torch.full((m,), delay).double()}
     rng = torch.Generator().manual_seed(1)
-    q, v, u = (torch.rand(3, 7, size, generator=rng).double() - 0.5 for size in (n, n, m))
-    chosen = torch.tensor([False, True, False, False, True, False, False])
+    q, v, u = (torch.rand(3, 11, size, generator=rng).double() - 0.5 for size in (n, n, m))
+    chosen = (torch.arange(11) == 1) | (torch.arange(11) == 8)
     together = ModelPlant(models[0], draws=models, threads=2, **settings)
     together.start(q[0], v[0])
     found = [together.advance(u[0], 0.01)]
     together.restart(chosen, q[1][chosen], v[1][chosen])
     found += [together.advance(u[k], 0.01) for k in (1, 2)]
     assert (together._loop is None) == (name == "wide")
-    for k in range(7):
+    for k in (0, 1, 5, 8, 9):
         alone = ModelPlant(models[k % 3], **settings)
         alone.start(q[0, k : k + 1], v[0, k : k + 1])
         expected = [alone.advance(u[0, k : k + 1], 0.01)]
