@@ -234,6 +234,8 @@ def test_a_planted_fault_gets_its_word_and_no_other(fault):
     for word in words:
         assert any(word in x for x in texts[name]), texts
     assert result.delay is None or name == DELAY
+    reasons = [x.reason for x in result.delays]
+    assert ("the drive saturates" in reasons) == (name == SATURATED)
 
 
 FORCES, MOTION = ("u1", "u2", "u3"), ("q1", "q2", "q3", "v1", "v2", "v3")
