@@ -270,6 +270,13 @@ def test_a_bad_run_gets_its_word_and_no_other(fault):
         assert all(f"run{k}" in text and word in text for text in texts[name]), texts
 
 
+def test_a_good_run_of_poses_that_no_other_run_has_is_not_bad():
+    t, (q, v), acting = motions(0, 0.0)[2]
+    q = q + np.array([0.0, 1.5, 1.0])
+    elsewhere = frame(t, q, torques(q, v, acting[0][2]), v)
+    assert read({**arm_runs(), "run2": elsewhere}) == {}
+
+
 def test_another_payload_is_named():
     frames = {**arm_runs(), "run2": arm_runs(load=1.6)["run2"]}
     assert "run run2 does not fit" in read(frames)[RESIDUAL][0]
