@@ -155,6 +155,20 @@ def test_a_start_and_an_input_are_predicted_as_the_model_does(model):
         np.testing.assert_allclose(predicted, expected, rtol=1e-9, atol=1e-12)
 
 
+def test_a_prediction_follows_the_present_weights(lnn_run):
+    run = pinn_dyn.load(lnn_run)
+    start, u, t = np.full(6, 0.1), 0.1 * np.ones((4, 3)), 0.01 * np.arange(4)
+    before = run.predict(start, u, t)
+    with torch.no_grad():
+        for parameter in run.model.parameters():
+            parameter.mul_(1.1)
+    times = torch.from_numpy(t)
+    signal = pinn_dyn.Signal(times, torch.from_numpy(u))
+    expected = run.model.predict(torch.from_numpy(start), times, signal).detach()
+    np.testing.assert_allclose(run.predict(start, u, t), expected, rtol=1e-9, atol=1e-12)
+    assert np.abs(before - expected.numpy()).max() > 1e-6
+
+
 START, T = np.zeros(6) + 0.1, np.arange(4) * 0.02
 
 
