@@ -213,8 +213,8 @@ def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem | Coup
     if not isinstance(model, MechanicalSystem):
         raise ConfigError(
             f"{run.folder} holds a black box ({run.config['model_name']}), which has no terms "
-            "M, G and A for a control law: give a run of model=lnn or model=hnn, or of "
-            "model=oscillators for controllers=latent"
+            "M, G and A for a control law. controllers=latent takes oscillators. For other laws, "
+            "give a run of model=lnn or model=hnn"
         )
     if not model.num_inputs:
         raise ConfigError(f"{run.folder}: the model has no inputs, so no control law can move it")

@@ -175,7 +175,7 @@ def test_mppi(home):
     pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
     text = run("mppi.py", "--duration", "0.04")
     assert float(re.search(r"largest speed: ([\d.]+)", text)[1]) < 1
-    assert float(re.search(r"goal: ([\d.]+)", text)[1]) < 0.6
+    assert float(re.search(r"goal: ([\d.]+)", text)[1]) < 0.65
 
 
 def test_train_policy(home):
