@@ -147,7 +147,7 @@ class ScalarFunction:
     Zeros of the structure cost nothing, and numbers that occur twice are computed once.
 
     Args:
-        program: the operations, see :func:`is_scalar`.
+        program: the operations; :func:`c_function` says for which programs this pays off.
         constants: arrays of the file.
 
     Attributes:
@@ -251,8 +251,8 @@ class ScalarFunction:
 
     def _called(self, node: fx.Node) -> np.ndarray:
         given: Any = node.args
-        function, size, _ = given
-        arguments = tuple(tuple(self._of[x].ravel().tolist()) for x in node.all_input_nodes)
+        function, size, sources = given
+        arguments = tuple(tuple(self._of[x].ravel().tolist()) for x in sources)
         call = self._terms.term("call", function, arguments, size)
         return np.array([self._terms.term("element", call, k) for k in range(size)], dtype=int)
 
