@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -113,8 +114,8 @@ def measure(model: ContinuousPredictor, trajectories: int, steps: int, timed_ste
     }
 
 
-def mujoco_steps_per_second(arm: MujocoArm, steps: int) -> int:
-    """Return the steps of ``mj_step`` with RK4 per second."""
+def mujoco_model(arm: MujocoArm) -> Any:
+    """Return the model of MuJoCo with RK4, without contacts, limits and friction."""
     import mujoco
 
     spec = mujoco.MjSpec.from_string(arm.text)
@@ -122,7 +123,14 @@ def mujoco_steps_per_second(arm: MujocoArm, steps: int) -> int:
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     spec.option.timestep = STEP
     spec.compiler.balanceinertia = True
-    model = spec.compile()
+    return spec.compile()
+
+
+def mujoco_steps_per_second(arm: MujocoArm, steps: int) -> int:
+    """Return the steps of ``mj_step`` with RK4 per second."""
+    import mujoco
+
+    model = mujoco_model(arm)
     data = mujoco.MjData(model)
     data.qfrc_applied[:] = 0.3
     start = time.process_time()

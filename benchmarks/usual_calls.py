@@ -25,7 +25,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import torch
-from long_rollout import FINGERS, PANDA, STEP, models_of
+from long_rollout import FINGERS, PANDA, STEP, models_of, mujoco_model
 from torch import Tensor
 
 from pinn_dyn.envs import ModelPlant, RobotEnv, RobotVectorEnv
@@ -114,12 +114,7 @@ def environment(model: KnownMechanics, count: int, steps: int) -> Callable[[], N
 
 
 def mujoco_calls(urdf: str, steps: int) -> dict[str, Callable[[], object]]:
-    spec = mujoco.MjSpec.from_string(MujocoArm(urdf, locked_joints=FINGERS).text)
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    spec.option.timestep = STEP
-    spec.compiler.balanceinertia = True
-    model = spec.compile()
+    model = mujoco_model(MujocoArm(urdf, locked_joints=FINGERS))
     data = mujoco.MjData(model)
     data.qfrc_applied[:] = 0.3
     starts = np.zeros((MOTIONS, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))

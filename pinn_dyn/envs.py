@@ -138,21 +138,19 @@ class ModelPlant(Plant):
         if len(self._models) == 1:
             integrator = cast(CLoop, self._model.integrator)
             return integrator.ready(self._model, self._x, self._step)
-        if not self._has_draws_in_c:
-            return None
-        if self._loop is not None:
+        if self._loop is not None or not self._has_draws_in_c:
             return self._loop
         stages, h = len(self._model.integrator.nodes), self._x.new_tensor(self._step)
         inputs = self._x.new_zeros(stages, self.num_inputs)
         try:
-            return LoopOfDraws(self._models, len(self._x), self._x[0], inputs, h)
+            return LoopOfDraws(self._models, self._x[0], inputs, h)
         except Exception:  # from a head that cannot be traced, a compiler or a full disk
             log.info("no loop in C for draws of %s", type(self._model).__name__, exc_info=True)
             self._has_draws_in_c = False
             return None
 
 
-class _Task:
+class _Setup:
     """The robot, the data and the limits of an environment, see :class:`RobotEnv`."""
 
     def __init__(
@@ -242,11 +240,11 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         u_low: Sequence[float] | None = None,
         u_high: Sequence[float] | None = None,
     ):
-        task = _Task(robot, data, step, (u_low, u_high))
-        self.plant, self.dt, self.region = task.plant, task.dt, task.region
+        setup = _Setup(robot, data, step, (u_low, u_high))
+        self.plant, self.dt, self.region = setup.plant, setup.dt, setup.region
         self.reward, self.steps = reward, max(1, round(duration / self.dt))
-        self._q, self._v, self.action_space = task.q, task.v, task.inputs
-        self.observation_space = task.observations(has_goal=reward is None)
+        self._q, self._v, self.action_space = setup.q, setup.v, setup.inputs
+        self.observation_space = setup.observations(has_goal=reward is None)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -320,17 +318,22 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         threads: PositiveInt = 1,
         autoreset: AutoresetMode = AutoresetMode.NEXT_STEP,
     ):
-        task = _Task(robot, data, step, (u_low, u_high), draws, threads)
-        if not isinstance(task.plant, ModelPlant):
+        setup = _Setup(robot, data, step, (u_low, u_high), draws, threads)
+        if not isinstance(setup.plant, ModelPlant):
             raise TypeError("a vector of robots needs a run: use gymnasium.make_vec for others")
         if draws is not None and isinstance(robot, ModelPlant):
             raise TypeError("draws need a run: give them to the ModelPlant")
-        self.num_envs, self.plant, self.dt, self.region = num_envs, task.plant, task.dt, task.region
+        self.num_envs, self.plant, self.dt, self.region = (
+            num_envs,
+            setup.plant,
+            setup.dt,
+            setup.region,
+        )
         self.reward, self.steps = reward, max(1, round(duration / self.dt))
-        self._starts = task.q.numpy(), task.v.numpy()
-        self.single_action_space = self._inputs = task.inputs
-        self.single_observation_space = task.observations(has_goal=reward is None)
-        self.action_space = gymnasium.vector.utils.batch_space(task.inputs, num_envs)
+        self._starts = setup.q.numpy(), setup.v.numpy()
+        self.single_action_space = self._inputs = setup.inputs
+        self.single_observation_space = setup.observations(has_goal=reward is None)
+        self.action_space = gymnasium.vector.utils.batch_space(setup.inputs, num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )

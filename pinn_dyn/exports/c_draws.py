@@ -17,7 +17,6 @@ class LoopOfDraws(Loop):
     Args:
         models: the models, with float64 tensors of the same shapes. Trajectory k is that of model
             ``k % len(models)``.
-        trajectories: number of trajectories.
         x, inputs, h: example of a state, of inputs at the stages and of a step.
 
     Raises:
@@ -28,7 +27,6 @@ class LoopOfDraws(Loop):
     def __init__(
         self,
         models: Sequence[ContinuousPredictor],
-        trajectories: int,
         x: Tensor,
         inputs: Tensor,
         h: Tensor,
@@ -50,13 +48,25 @@ class LoopOfDraws(Loop):
                     numbers.drawn[node.meta["val"].data_ptr()] = rows
         code, values = loop_code(programs, True, numbers)
         super().__init__(code, values)
-        lanes = self._library.number_of_lanes()
-        self._size = values.shape[-1]
-        index = torch.arange(-(-trajectories // lanes) * lanes) % len(models)
-        self._values = values[index].unflatten(0, (-1, lanes)).mT.contiguous()
+        self._of_models, self._trajectories = values, 0
+
+    def __call__(
+        self,
+        increment: Tensor,
+        start: Tensor,
+        inputs: Tensor,
+        lengths: Tensor,
+        threads: int = 1,
+    ) -> Tensor:
+        if len(start) != self._trajectories:
+            lanes = self._library.number_of_lanes()
+            index = torch.arange(-(-len(start) // lanes) * lanes) % len(self._of_models)
+            self._values = self._of_models[index].unflatten(0, (-1, lanes)).mT.contiguous()
+            self._trajectories = len(start)
+        return super().__call__(increment, start, inputs, lengths, threads)
 
     def _values_of(self, part: slice) -> Tensor:
-        return self._values.flatten()[part.start * self._size :]
+        return self._values.flatten()[part.start * self._of_models.shape[-1] :]
 
 
 def _tensors(model: ContinuousPredictor) -> list[Tensor]:

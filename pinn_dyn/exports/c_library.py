@@ -51,8 +51,8 @@ def compiled_rows(
         (n,), (m,) = x.shape, function(x).shape
 
         def call(values: Tensor) -> Tensor:
-            if values.shape[-1] != n or values.dtype != torch.float64:
-                return function(values)  # which refuses them
+            if values.shape[-1] != n or values.dtype != torch.float64 or not values.is_cpu:
+                return function(values)  # which refuses wrong shapes
             values = values.contiguous()
             result = values.new_empty(*values.shape[:-1], m)
             pointers = (ctypes.c_void_p(array.data_ptr()) for array in (values, result))

@@ -314,12 +314,12 @@ def rows_in_c(
     """Return a function of a model for rows, in C if that pays off, see :func:`compiled_rows`.
 
     Args:
-        model: the model in float64 on the CPU.
-        name: name of the function.
+        model: the model of the function.
+        name: name of the function, also of the settings that are not in the model.
         function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently.
-        rows: the next argument of the function, ``(*batch, n)``, float64.
+        rows: the next argument of the function, ``(*batch, n)``.
     """
-    if not rows.numel():
+    if not rows.numel() or rows.dtype != torch.float64 or not rows.is_cpu:
         return function
     try:
         key = f"{_key_of(model)}{name}"

@@ -246,6 +246,14 @@ def test_robots_with_other_constants_move_as_their_own_models(name, delay):
         for (a, b), (c, d) in zip(found, expected, strict=True):
             torch.testing.assert_close(a[k], c[0], rtol=0, atol=1e-10)
             torch.testing.assert_close(b[k], d[0], rtol=0, atol=1e-10)
+    more = torch.cat([q[0], q[1]]), torch.cat([v[0], v[1]])
+    together.start(*more)  # more copies than before
+    found = together.advance(torch.cat([u[0], u[0]]), 0.01)
+    last = len(more[0]) - 1
+    alone = ModelPlant(models[last % 3], **settings)
+    alone.start(more[0][last:], more[1][last:])
+    expected = alone.advance(u[0, -1:], 0.01)
+    torch.testing.assert_close(found[0][last], expected[0][0], rtol=0, atol=1e-10)
 
 
 def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):

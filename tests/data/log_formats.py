@@ -121,7 +121,7 @@ def write_compound(path, table):
 
 
 def write_mat73(path, table):
-    """As MATLAB does: HDF5 behind a header of its own, matrices transposed."""
+    """Write a MAT file of version 7.3: HDF5 after a header, with transposed matrices."""
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in arrays_of(table).items():
             data = file.create_dataset(f"log/{name}", data=np.atleast_2d(values.T))
@@ -210,7 +210,7 @@ FORMATS = {
     "db3": (functools.partial(write_bag_file, mcap=False), BAG),
     "bag": (functools.partial(write_bag, version=1), BAG),
 }
-"""Of gripper.mcap another node publishes on the topic, without velocities."""
+"""Formats of one table. In gripper.mcap, a second node publishes positions on the same topic."""
 
 
 def write_lerobot(folder, table, episodes=3):

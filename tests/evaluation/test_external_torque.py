@@ -105,7 +105,7 @@ def test_a_minute_of_free_motion_gives_no_alarm(run):
 
 
 def test_stiction_is_no_external_torque(run):
-    """Without the friction of joints at rest, the thresholds must contain all of its levels."""
+    """Thresholds contain all friction levels if the friction at rest is left out."""
     quiet = run.source.load().validation
     with_rest = contact_thresholds(run.system, quiet, BANDWIDTH, 1.0)
     with pytest.MonkeyPatch.context() as patch:

@@ -185,13 +185,13 @@ def bad(measurements):
 
 
 def findings(frames, structure=None, unit="Nm"):
-    """What the check finds, and the check."""
+    """Return the findings of the check, and the check."""
     result = check(log_of(frames, u_unit=unit), structure=structure)
     return bad(result.measurements), result
 
 
 def read(frames, *units):
-    """What the comparison of runs finds, without the rest of the check."""
+    """Return the findings of the comparison of runs alone."""
     return bad(log_of(frames, *units).measurements)
 
 
