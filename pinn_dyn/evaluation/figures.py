@@ -172,12 +172,15 @@ def modes_figure(modes: Modes, *, title: str, labels: Sequence[str]) -> Figure:
     plane.set(xscale="log", xlabel="eigenfrequency [Hz]", ylabel="damping ratio", ylim=(0, 1.08))
     for formatted in (plane.xaxis.set_major_formatter, plane.xaxis.set_minor_formatter):
         formatted("{x:g}")
+    plane.set_title("area: share in the motion, the largest is 1", fontsize="medium")
     plane.grid(True, alpha=0.3)
     values = modes.relative_shapes[: len(strongest)]
     shapes.imshow(values, cmap="RdBu_r", vmin=-1.6, vmax=1.6, aspect="auto")
     for i, row in enumerate(values.tolist()):
         for j, value in enumerate(row):
-            shapes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize="small")
+            shapes.text(
+                j, i, f"{round(value, 2) + 0.0:.2f}", ha="center", va="center", fontsize="small"
+            )
     names = [f"{k + 1}: {frequency[k]:.3g} Hz, ζ {damping[k]:.2f}" for k in strongest]
     shapes.set_xticks(range(len(labels)), labels)
     shapes.set_yticks(strongest, names)
