@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.identification import constants_covariance, constants_table
+from pinn_dyn.identification.constants import constants_covariance, constants_table
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import Fit, LeastSquares

@@ -20,7 +20,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs import LogSource, Request
 from pinn_dyn.data.logs.readers import read_tables
-from pinn_dyn.evaluation.log_check import check as check_log
+from pinn_dyn.log_check.check import check as check_log
 
 RATE = 1000.0
 JOINTS = [f"panda_joint{k + 1}" for k in range(7)]

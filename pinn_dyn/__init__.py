@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from pinn_dyn.data import LogSource as LogSource
     from pinn_dyn.data import Splits as Splits
     from pinn_dyn.evaluation.closed_loops import close_loop as close_loop
-    from pinn_dyn.evaluation.excitation_design import design_excitation as design_excitation
-    from pinn_dyn.evaluation.log_check import check as check
+    from pinn_dyn.identification.excitation_design import design_excitation as design_excitation
+    from pinn_dyn.log_check.check import check as check
     from pinn_dyn.mechanics import MechanicalSystem as MechanicalSystem
     from pinn_dyn.mechanics import Signal as Signal
     from pinn_dyn.mechanics import Terms as Terms

@@ -72,7 +72,7 @@ def undrawn(monkeypatch):
     """No pictures and no pages of the programs: they take longer than all else."""
     monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
     monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
-    monkeypatch.setattr("pinn_dyn.evaluation.log_check.LogCheck.save", lambda *_: "nowhere")
+    monkeypatch.setattr("pinn_dyn.log_check.check.LogCheck.save", lambda *_: "nowhere")
     evaluation = "pinn_dyn.evaluation"
     monkeypatch.setattr(f"{evaluation}.Evaluation.figures", lambda *_: iter(()))
     page = f"{evaluation}.report.prediction_page.prediction_report"

@@ -11,9 +11,9 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
 from pinn_dyn.data import LogSource
-from pinn_dyn.evaluation.log_check import LogCheck
-from pinn_dyn.evaluation.log_check import check as check_log
-from pinn_dyn.evaluation.structure_check import SCALE
+from pinn_dyn.log_check.check import LogCheck
+from pinn_dyn.log_check.check import check as check_log
+from pinn_dyn.log_check.structure import SCALE
 from pinn_dyn.run.build import ConfigError, build_part, build_source, naming
 from pinn_dyn.run.known_data import match_structure
 from pinn_dyn.run.program import command_line

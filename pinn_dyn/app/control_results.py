@@ -19,7 +19,6 @@ from pinn_dyn.control import (
     stability_report,
 )
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import (
     ControlResult,
     animate,
@@ -36,6 +35,7 @@ from pinn_dyn.evaluation.tables import to_text, with_unit, write_table
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.systems import Drawable, HasTip
+from pinn_dyn.whole import write_whole
 
 _ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
 

@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
-from pinn_dyn.evaluation.excitation_design import design_excitation
+from pinn_dyn.identification.excitation_design import design_excitation
 from pinn_dyn.run.build import ConfigError, build_part
 from pinn_dyn.run.run_folder import write_config
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
     from pinn_dyn.data import DataSource, DynamicsData, InitialStates
     from pinn_dyn.evaluation import RolloutValidator
-    from pinn_dyn.evaluation.motion_limits import JointValues, MotionLimits
+    from pinn_dyn.identification.motion_limits import JointValues, MotionLimits
     from pinn_dyn.mechanics import Predictor
     from pinn_dyn.models.structure import Structure
     from pinn_dyn.systems import RigidChain

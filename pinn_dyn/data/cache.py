@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock
 
-from pinn_dyn.data.whole import whole
+from pinn_dyn.whole import whole
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
-from pinn_dyn.data.whole import whole
 from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.whole import whole
 
 
 @dataclass(eq=False)

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
         trajectory_figure,
     )
     from pinn_dyn.evaluation.log_figures import cleaning_figure
-    from pinn_dyn.evaluation.plots import save
     from pinn_dyn.evaluation.rollout_figures import RolloutFigures
     from pinn_dyn.evaluation.validation import RolloutValidator
+    from pinn_dyn.plots import save
 
 __all__ = [
     "Calibration",

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
-from pinn_dyn.evaluation.plots import COLORS, TRUTH
+from pinn_dyn.plots import COLORS, TRUTH
 from pinn_dyn.systems import Drawable
 
 _TIP = "#CC0000"

@@ -26,11 +26,11 @@ from pinn_dyn.control import (
 from pinn_dyn.control import close_loop as close_sampled_loop
 from pinn_dyn.control.dead_time import compensated
 from pinn_dyn.control.references import check_limits
-from pinn_dyn.data.whole import whole
 from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_metrics
 from pinn_dyn.evaluation.tables import write_table
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
 from pinn_dyn.systems import HasDomain, HasLimits, Stepped
+from pinn_dyn.whole import whole
 
 RATE = 1000.0
 """Default control instants per second, 1/s."""

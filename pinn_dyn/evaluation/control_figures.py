@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop, stopped_runs
-from pinn_dyn.evaluation.plots import (
+from pinn_dyn.evaluation.tables import with_unit
+from pinn_dyn.plots import (
     COLORS,
     DARK,
     TRUTH,
@@ -22,7 +23,6 @@ from pinn_dyn.evaluation.plots import (
     panels,
     set_log_axis,
 )
-from pinn_dyn.evaluation.tables import with_unit
 
 ERROR = "‖q_ref − q‖₂"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -63,89 +63,121 @@ def closed_loop_metrics(
         settled_after: time from which the step error is taken, s; None leaves it out.
         u_low, u_high: limits of the inputs, one number or M; None for no limit.
     """
-    t = record.t.double() - record.t[0].double()
-    duration = float(t[-1])
-    lost = stopped_runs(record)
-    counted = lost if lost.all() else ~lost
-
-    def marked(values: Tensor) -> Tensor:
-        """Return the values ``(K, ...)`` with infinity for the stopped runs."""
-        return torch.where(lost.view(-1, *[1] * (values.ndim - 1)), torch.inf, values)
-
-    def mean(values: Tensor) -> Tensor:
-        return marked(values)[counted].mean(dim=0)
-
+    runs = _Runs(stopped_runs(record))
     error = (record.reference.q - record.q).double()
     norm = error.norm(dim=-1)
-    square = error.square().mean(dim=1)  # (K, N)
-    steady = norm[:, t >= 0.9 * duration].mean(dim=1)
+    square = runs.mean(error.square().mean(dim=1))  # (N,)
     summary: dict[str, Any] = {
-        "runs": len(lost),
-        "stopped": int(lost.sum()),
-        "rms_error": mean(square).mean().sqrt(),
-        "mean_error": mean(norm.mean(dim=1)),
-        "max_error": marked(norm.amax(dim=1)).max(),
+        "runs": len(runs.lost),
+        "stopped": int(runs.lost.sum()),
+        "rms_error": square.mean().sqrt(),
+        "mean_error": runs.mean(norm.mean(dim=1)),
+        "max_error": runs.marked(norm.amax(dim=1)).max(),
     }
-    coordinates = {
-        "rms_error": mean(square).sqrt(),
-        "max_error": marked(error.abs().amax(dim=1)).amax(dim=0),
-    }
+    largest = runs.marked(error.abs().amax(dim=1)).amax(dim=0)
+    coordinates = {"rms_error": square.sqrt(), "max_error": largest}
+    t = record.t.double() - record.t[0].double()
+    steady = norm[:, t >= 0.9 * t[-1]].mean(dim=1)
     step = _set_point_step(record)
     if step is None:
-        summary["steady_state_error"] = mean(steady)
+        summary["steady_state_error"] = runs.mean(steady)
     else:
         size = step.norm(dim=-1)
-        after = t >= (math.inf if settled_after is None else settled_after) - 1e-9 * duration
-        if after.any():
-            ratio = 100 * marked(norm[:, after].amax(dim=1) / size)
-            name = f"step_error_after_{settled_after:g}_s"
-            summary[f"{name}_mean_percent"] = mean(ratio)
-            summary[f"{name}_worst_percent"] = ratio.max()
-        settling = marked(_settling_times(norm, t, _SETTLED * size))
-        beyond = (-error * step.sign()[:, None]).amax(dim=1).clamp(min=0)
-        steps = step.abs()
-        large = steps >= _SMALL_STEP * steps.amax(dim=1, keepdim=True)
-        overshoot = torch.where(large, marked(100 * beyond / steps), torch.nan)  # (K, N)
+        summary |= _step_errors(runs, t, norm / size[:, None], settled_after)
+        overshoot = _overshoot(runs, error, step)
         summary |= {
-            "settling_time_median_s": median(settling.tolist()),
-            "settling_time_worst_s": settling.max(),
-            "never_settled": int(settling.isinf().sum()),
-            "overshoot_mean_percent": overshoot[counted].nanmean(),
+            "overshoot_mean_percent": overshoot[runs.counted].nanmean(),
             "overshoot_worst_percent": _nanmax(_nanmax(overshoot)),
-            "steady_state_error": mean(steady),
-            "steady_state_error_percent": 100 * mean(steady / size),
+            "steady_state_error": runs.mean(steady),
+            "steady_state_error_percent": 100 * runs.mean(steady / size),
         }
-        coordinates["overshoot_mean_percent"] = overshoot[counted].nanmean(dim=0)
+        coordinates["overshoot_mean_percent"] = overshoot[runs.counted].nanmean(dim=0)
         coordinates["overshoot_worst_percent"] = _nanmax(overshoot)
-
     held = record.u[:, :-1].double()
-    effort = (held.square() * t.diff()[:, None]).sum(dim=1)  # (K, M)
-    summary |= {
-        "input_rms": (mean(effort).mean() / duration).sqrt(),
-        "input_peak": marked(held.abs().amax(dim=(1, 2)))[counted].max(),
-        "input_square_integral": mean(effort.sum(dim=-1)),
-        "input_variation_per_s": mean(held.diff(dim=1).norm(dim=-1).sum(dim=1) / duration),
-    }
+    summary |= _input_effort(runs, t, held)
     if u_low is not None or u_high is not None:
-        low = torch.as_tensor(-math.inf if u_low is None else u_low, dtype=held.dtype)
-        high = torch.as_tensor(math.inf if u_high is None else u_high, dtype=held.dtype)
-        saturated = int(((held <= low) | (held >= high)).any(dim=-1).sum())
-        applied = int(torch.isfinite(held).all(dim=-1).sum())
-        summary["saturated_samples"] = saturated
-        summary["saturated_percent"] = 100 * saturated / max(applied, 1)
+        summary |= _saturation(held, u_low, u_high)
     if "solve_time" in record.diagnostics:
-        names = ("solve_time", "missed_deadline", "solver_failed")
-        times, missed, failed = (record.diagnostics[x].double().nan_to_num(0.0) for x in names)
-        summary |= {
-            "solve_time_median_ms": 1e3 * record.diagnostics["solve_time"].double().nanmedian(),
-            "solve_time_largest_ms": 1e3 * times[:, 1:].max(),
-            "missed_deadlines": int(missed.sum()),
-            "solver_failures": int(failed.sum()),
-        }
+        summary |= _solver_times(record.diagnostics)
     table = pd.DataFrame({name: x.tolist() for name, x in coordinates.items()})
     table.insert(0, "coordinate", [f"q{i + 1}" for i in range(len(table))])
     numbers = {k: x.item() if isinstance(x, Tensor) else x for k, x in summary.items()}
     return ClosedLoopMetrics(numbers, table)
+
+
+class _Runs:
+    """Means over the runs that were not stopped; over all if all were stopped."""
+
+    def __init__(self, lost: Tensor):
+        self.lost = lost
+        self.counted = lost if lost.all() else ~lost
+
+    def marked(self, values: Tensor) -> Tensor:
+        """Return the values ``(K, ...)`` with infinity for the stopped runs."""
+        return torch.where(self.lost.view(-1, *[1] * (values.ndim - 1)), torch.inf, values)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Return the mean of values ``(K, ...)`` over the runs."""
+        return self.marked(values)[self.counted].mean(dim=0)
+
+
+def _step_errors(
+    runs: _Runs, t: Tensor, relative: Tensor, settled_after: float | None
+) -> dict[str, Any]:
+    """Return the times to settle, and errors relative to the step ``(K, T)`` from a time on."""
+    errors: dict[str, Any] = {}
+    if settled_after is not None:
+        after = t >= settled_after - 1e-9 * t[-1]
+        if after.any():
+            percent = 100 * runs.marked(relative[:, after].amax(dim=1))
+            name = f"step_error_after_{settled_after:g}_s"
+            errors[f"{name}_mean_percent"] = runs.mean(percent)
+            errors[f"{name}_worst_percent"] = percent.max()
+    settling = runs.marked(_settling_times(relative, t))
+    return errors | {
+        "settling_time_median_s": median(settling.tolist()),
+        "settling_time_worst_s": settling.max(),
+        "never_settled": int(settling.isinf().sum()),
+    }
+
+
+def _overshoot(runs: _Runs, error: Tensor, step: Tensor) -> Tensor:
+    """Return the distance beyond the set point in percent of the step, NaN for small steps."""
+    beyond = (-error * step.sign()[:, None]).amax(dim=1).clamp(min=0)
+    steps = step.abs()
+    large = steps >= _SMALL_STEP * steps.amax(dim=1, keepdim=True)
+    return torch.where(large, runs.marked(100 * beyond / steps), torch.nan)  # (K, N)
+
+
+def _input_effort(runs: _Runs, t: Tensor, held: Tensor) -> dict[str, Any]:
+    duration = float(t[-1])
+    effort = (held.square() * t.diff()[:, None]).sum(dim=1)  # (K, M)
+    return {
+        "input_rms": (runs.mean(effort).mean() / duration).sqrt(),
+        "input_peak": runs.marked(held.abs().amax(dim=(1, 2)))[runs.counted].max(),
+        "input_square_integral": runs.mean(effort.sum(dim=-1)),
+        "input_variation_per_s": runs.mean(held.diff(dim=1).norm(dim=-1).sum(dim=1) / duration),
+    }
+
+
+def _saturation(held: Tensor, u_low: Limit, u_high: Limit) -> dict[str, Any]:
+    low = torch.as_tensor(-math.inf if u_low is None else u_low, dtype=held.dtype)
+    high = torch.as_tensor(math.inf if u_high is None else u_high, dtype=held.dtype)
+    saturated = int(((held <= low) | (held >= high)).any(dim=-1).sum())
+    applied = int(torch.isfinite(held).all(dim=-1).sum())
+    percent = 100 * saturated / max(applied, 1)
+    return {"saturated_samples": saturated, "saturated_percent": percent}
+
+
+def _solver_times(diagnostics: Mapping[str, Tensor]) -> dict[str, Any]:
+    names = ("solve_time", "missed_deadline", "solver_failed")
+    times, missed, failed = (diagnostics[x].double().nan_to_num(0.0) for x in names)
+    return {
+        "solve_time_median_ms": 1e3 * diagnostics["solve_time"].double().nanmedian(),
+        "solve_time_largest_ms": 1e3 * times[:, 1:].max(),
+        "missed_deadlines": int(missed.sum()),
+        "solver_failures": int(failed.sum()),
+    }
 
 
 def stopped_runs(record: ClosedLoopRecord) -> Tensor:
@@ -170,8 +202,8 @@ def _set_point_step(record: ClosedLoopRecord) -> Tensor | None:
     return step
 
 
-def _settling_times(norm: Tensor, t: Tensor, bound: Tensor) -> Tensor:
-    last = torch.where(~(norm <= bound[:, None]), torch.arange(len(t)), -1).amax(dim=1)
+def _settling_times(relative: Tensor, t: Tensor) -> Tensor:
+    last = torch.where(~(relative <= _SETTLED), torch.arange(len(t)), -1).amax(dim=1)
     return torch.cat([t, t.new_full((1,), math.inf)])[last + 1]
 
 

@@ -15,9 +15,9 @@ from scipy.signal import lfilter
 from torch import Tensor
 
 from pinn_dyn.control.observer import DisturbanceObserver, rest_speeds
-from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels, save
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
+from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels, save
 from pinn_dyn.systems import RigidChain
 
 _BLOCK = 10.0  # time constants of the observer in a block of independent maxima

@@ -13,7 +13,11 @@ from torch import Tensor
 from pinn_dyn.evaluation.calibration import Calibration
 from pinn_dyn.evaluation.learned_terms import TermComparison
 from pinn_dyn.evaluation.metrics import diverged_trajectories
-from pinn_dyn.evaluation.plots import (
+from pinn_dyn.evaluation.prediction import Prediction
+from pinn_dyn.evaluation.tables import number, with_unit
+from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.models.modes import Modes
+from pinn_dyn.plots import (
     DARK,
     TRUTH,
     baseline_style,
@@ -25,10 +29,6 @@ from pinn_dyn.evaluation.plots import (
     panels,
     set_log_axis,
 )
-from pinn_dyn.evaluation.prediction import Prediction
-from pinn_dyn.evaluation.tables import number, with_unit
-from pinn_dyn.mechanics import Trajectory
-from pinn_dyn.models.modes import Modes
 
 ERROR = "‖q̂ − q‖₂"
 _TERMS = {"M": "$M(q)$", "M_inverse": "$M^{-1}(q)$", "D": "$D(q)$", "G": "$G(q)$", "A": "$A(q)$"}

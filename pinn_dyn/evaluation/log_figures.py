@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import Cleaned
-from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels
+from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels
 
 
 def cleaning_figure(

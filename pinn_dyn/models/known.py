@@ -97,28 +97,14 @@ class KnownMechanics(LearnedConstants):
                 f"structure is a {type(structure).__name__}, expected rigid bodies such as a "
                 "RigidChain: use model=known_system for the constants of other systems"
             )
-        names, size = structure.joint_names, structure.num_coordinates
-        elastic = structure if isinstance(structure, ElasticJoints) else None
-        inputs = statistics.num_inputs
-        driven = list(driven_joints or (elastic.driven if elastic else names)) if inputs else []
-        if input is not None and inputs == 2 * len(driven):
-            inputs //= 2  # targets and feed-forward forces
-        sizes = statistics.num_coordinates, inputs
-        if sizes != (size, len(driven)) or len(set(driven) & set(names)) < len(driven):
-            raise ValueError(
-                f"the data have {sizes[0]} coordinates and {sizes[1]} inputs, expected the {size} "
-                f"joints {', '.join(names)} and inputs of {', '.join(driven)}: name the "
-                "joints that have an input, as driven_joints=[...]"
-            )
+        names = structure.joint_names
+        driven = _driven_joints(statistics, structure, driven_joints, input is not None)
         if unknown := set(springs) - set(names):
             expected = ", ".join(names)
             raise ValueError(f"springs names {', '.join(unknown)}, expected some of {expected}")
-        super().__init__(size, statistics.num_inputs)
+        super().__init__(len(names), statistics.num_inputs)
         self.structure = structure
         self.driven = [names.index(name) for name in driven]
-        gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
-        acceleration = statistics.acceleration.double()
-        joints = tuple(map(Joint, names, structure.turning))
         generic = structure.generic_inertia()
         bodies = structure.prior_inertia() if start == "prior" else generic
         spreads = _spreads(spread, structure.body_names)
@@ -129,8 +115,10 @@ class KnownMechanics(LearnedConstants):
         # Rods for the links of an arm. The last body has no link, so a single rod has no size.
         largest = 100.0 if len(driven) > 1 else math.inf
         self._largest_ratio = 5.0 if spreads.median() <= 1 else largest
+        gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
         drives = None if input else gain * statistics.u_rms.double()
         force = self._typical_forces(statistics, bodies, drives)
+        joints = tuple(map(Joint, names, structure.turning))
         scales = Scales(statistics, force, named=joints, prior=True)
         self.servo = input and input(scales, joints=self.driven)
         if self.servo is not None:
@@ -138,21 +126,9 @@ class KnownMechanics(LearnedConstants):
             force = self.servo.typical_force(force)
             scales = replace(scales, value=force)
             self.input_affine = self.servo.affine
-        inertia, damping = force / acceleration, force / statistics.v_std.double()
-        motors = replace(scales, named=tuple(joints[k] for k in self.driven))
-        units = [joint.inertia for joint in motors.joints]
-        self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, units)
-        units = [joint.damping for joint in joints]
-        self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, units)
-        offsets = [k for k in self.driven if names[k] not in springs]
-        self.offset = RealConstants(
-            0.3 * force[offsets],
-            [f"{'torque' if joints[k].turns else 'force'} offset of {names[k]}" for k in offsets],
-            [joints[k].force for k in offsets],
-        )
-        index = [names.index(name) for name in springs]
-        self.springs = JointSprings(scales, index) if springs else None
+        offsets = self._set_drives(statistics, scales, springs)
         self.friction = friction(scales)
+        motors = replace(scales, named=tuple(joints[k] for k in self.driven))
         self.limits = limits and limits(replace(motors, value=force[self.driven]))
         if self.limits or self.friction.by_load:
             if self.servo is not None:
@@ -160,20 +136,48 @@ class KnownMechanics(LearnedConstants):
             self.input_affine = False
         self.sticking = self.friction.sticking
         self.integrator = with_friction(integrator, self.sticking)
-        self.elastic = Springs(elastic) if elastic else None
+        self.elastic = Springs(structure) if isinstance(structure, ElasticJoints) else None
         self.gain: Constants | None = None
         if gain_spread > 0 and self.servo is None:
             units = [f"{joint.force}/u" for joint in motors.joints]
             self.gain = motors.positive("drive gain", 1.0, gain, gain_spread, units)
+        self._set_buffers(gain, offsets, force)
+        self.float()
+
+    def _set_drives(
+        self, statistics: Statistics, scales: Scales, springs: Sequence[str]
+    ) -> list[int]:
+        """Set armatures, friction, offsets and springs; return the joints with an offset."""
+        joints, force = scales.joints, scales.value.double()
+        inertia = force / statistics.acceleration.double()
+        damping = force / statistics.v_std.double()
+        motors = replace(scales, named=tuple(joints[k] for k in self.driven))
+        units = [joint.inertia for joint in motors.joints]
+        self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, units)
+        units = [joint.damping for joint in joints]
+        self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, units)
+        names = self.structure.joint_names
+        offsets = [k for k in self.driven if names[k] not in springs]
+        kinds = ["torque" if joints[k].turns else "force" for k in offsets]
+        self.offset = RealConstants(
+            0.3 * force[offsets],
+            [f"{kind} offset of {names[k]}" for kind, k in zip(kinds, offsets, strict=True)],
+            [joints[k].force for k in offsets],
+        )
+        index = [names.index(name) for name in springs]
+        self.springs = JointSprings(scales, index) if springs else None
+        return offsets
+
+    def _set_buffers(self, gain: Tensor, offsets: list[int], force: Tensor) -> None:
+        unit = torch.eye(self.num_coordinates)
         self.register_buffer("fixed_gain", gain.clone())
-        self.register_buffer("motors", torch.eye(size)[self.driven], persistent=False)
-        self.register_buffer("offset_joints", torch.eye(size)[offsets], persistent=False)
+        self.register_buffer("motors", unit[self.driven], persistent=False)
+        self.register_buffer("offset_joints", unit[offsets], persistent=False)
         self.register_buffer("typical_force", force, persistent=False)
         self.fixed_gain: Tensor
         self.motors: Tensor
         self.offset_joints: Tensor
         self.typical_force: Tensor
-        self.float()
 
     def _typical_forces(
         self, statistics: Statistics, bodies: Tensor, driven: Tensor | None
@@ -377,6 +381,30 @@ class KnownMechanics(LearnedConstants):
 
     def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
         return self.friction.sliding(v, share)
+
+
+def _driven_joints(
+    statistics: Statistics,
+    structure: Structure,
+    driven_joints: Sequence[str] | None,
+    with_servos: bool,
+) -> list[str]:
+    """Return the names of the joints that the inputs drive."""
+    names, inputs = structure.joint_names, statistics.num_inputs
+    driven: list[str] = []
+    if inputs:
+        default = structure.driven if isinstance(structure, ElasticJoints) else names
+        driven = list(driven_joints or default)
+    if with_servos and inputs == 2 * len(driven):
+        inputs //= 2  # targets and feed-forward forces
+    sizes, expected = (statistics.num_coordinates, inputs), (len(names), len(driven))
+    if sizes != expected or len(set(driven) & set(names)) < len(driven):
+        raise ValueError(
+            f"the data have {sizes[0]} coordinates and {sizes[1]} inputs, expected the "
+            f"{len(names)} joints {', '.join(names)} and inputs of {', '.join(driven)}: name the "
+            "joints that have an input, as driven_joints=[...]"
+        )
+    return driven
 
 
 def _spreads(spread: float | Mapping[str, float], bodies: Sequence[str]) -> Tensor:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from torch.nn.utils import vector_to_parameters
 
-from pinn_dyn.data import DataSource, LogSource, data_changes, data_identity
+from pinn_dyn.data import DataSource, LogSource, Splits, data_changes, data_identity
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
-from pinn_dyn.evaluation.identification import read_constants
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
+from pinn_dyn.identification.constants import read_constants
 from pinn_dyn.mechanics import double_copy, stack_until
 from pinn_dyn.progress import Progress
 from pinn_dyn.run.run import Run
@@ -63,12 +64,7 @@ def evaluate(
     runs = [runs] if isinstance(runs, Run) else list(runs)
     shared: dict[str, DataSource] = {}
     sources = [shared.setdefault(str(run.config["dataset"]), run.source) for run in runs]
-    for run, trained_on in zip(runs, sources, strict=True):
-        require_same_data(run.folder, run.data, trained_on.name, data_identity(trained_on))
-        if source is None:
-            _require_same_test(run, runs[0], split)
-        else:
-            _require_fitting_test(run, trained_on, source)
+    _require_comparable(runs, sources, source, split)
     source = source or sources[0]
     splits = {item: item.load() for item in {*sources, source}}
     motions = getattr(splits[source], split)
@@ -93,8 +89,7 @@ def evaluate(
             own_step,
             model,
             seed=run.config["seed"],
-            figures={k: run.metrics[k] for k in _COLUMNS if k in run.metrics}
-            | {"folder": str(run.folder)},
+            figures=_figures_of(run),
             members=run.ensemble,
         )
         for name, model, run, trained_on, own_step in zip(
@@ -106,13 +101,7 @@ def evaluate(
         training = splits[sources[0]]
         predictors = build_baselines(training.train, training.validation, step=grid)
         baselines = [Entry(name, x, training, grid, name) for name, x in predictors.items()]
-        for model, run, trained_on, own_step in zip(models, runs, sources, steps, strict=True):
-            name = f"identification of {model}"
-            z = None if run.metrics.get("stage") == IDENTIFICATION else run.identified
-            if z is not None and name not in {entry.run for entry in baselines}:
-                identified = double_copy(run.model)  # before the rollouts
-                vector_to_parameters(z.double(), identified.parameters())
-                baselines.append(Entry(name, identified, splits[trained_on], own_step, name))
+        baselines += _identifications(runs, models, [splits[x] for x in sources], steps)
         evaluation = evaluate_models(
             entries,
             baselines,
@@ -127,6 +116,37 @@ def evaluate(
     folders = {name: run.folder for name, run in zip(names, runs, strict=True)}
     evaluation.constants = read_constants(folders)
     return evaluation
+
+
+def _identifications(
+    runs: Sequence[Run], models: Sequence[str], data: Sequence[Splits], steps: Sequence[float]
+) -> list[Entry]:
+    """Return the identified constants of fits that went on to rollouts, once for each model."""
+    entries: dict[str, Entry] = {}
+    for model, run, splits, step in zip(models, runs, data, steps, strict=True):
+        name = f"identification of {model}"
+        z = None if run.metrics.get("stage") == IDENTIFICATION else run.identified
+        if z is not None and name not in entries:
+            identified = double_copy(run.model)
+            vector_to_parameters(z.double(), identified.parameters())
+            entries[name] = Entry(name, identified, splits, step, name)
+    return list(entries.values())
+
+
+def _figures_of(run: Run) -> dict[str, Any]:
+    return {k: run.metrics[k] for k in _COLUMNS if k in run.metrics} | {"folder": str(run.folder)}
+
+
+def _require_comparable(
+    runs: Sequence[Run], sources: Sequence[DataSource], source: DataSource | None, split: str
+) -> None:
+    """Refuse runs whose data have changed, and runs of different data or other robots."""
+    for run, trained_on in zip(runs, sources, strict=True):
+        require_same_data(run.folder, run.data, trained_on.name, data_identity(trained_on))
+        if source is None:
+            _require_same_test(run, runs[0], split)
+        else:
+            _require_fitting_test(run, trained_on, source)
 
 
 def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:

@@ -17,17 +17,16 @@ import torch
 
 from pinn_dyn import evaluation
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import save_whole, write_whole
-from pinn_dyn.evaluation.identification import (
+from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.evaluation.tables import units
+from pinn_dyn.identification.constants import (
     CONSTANTS,
     common_factor,
     constants_table,
     contradicted,
     undetermined,
 )
-from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
-from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
-from pinn_dyn.evaluation.tables import units
+from pinn_dyn.identification.rigid_excitation import rigid_excitation
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.run.build import ConfigError, naming
@@ -36,6 +35,7 @@ from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
 from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
+from pinn_dyn.whole import save_whole, write_whole
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from pinn_dyn.data import DataSource, LogSource
-from pinn_dyn.evaluation.structure_check import compare_structure
+from pinn_dyn.log_check.structure import compare_structure
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models import KnownMechanics
 from pinn_dyn.run.build import ConfigError, ModelBuilder

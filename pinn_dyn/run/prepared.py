@@ -14,7 +14,6 @@ import torch
 
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
 from pinn_dyn.data.fastest_motion import too_long_for
-from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.mechanics import Predictor, stack_until
@@ -33,6 +32,7 @@ from pinn_dyn.run.run_folder import (
     in_one_line,
     require_same_data,
 )
+from pinn_dyn.whole import write_whole
 
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""

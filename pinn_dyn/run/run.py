@@ -20,14 +20,14 @@ from torch import Tensor
 
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
-from pinn_dyn.evaluation.adaptation import Adaptation, Constant, adapted_constants
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
-from pinn_dyn.evaluation.payload import identify_payload
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.c_loop import rows_in_c, versions_of
 from pinn_dyn.exports.exported import Real
+from pinn_dyn.identification.adaptation import Adaptation, Constant, adapted_constants
+from pinn_dyn.identification.payload import identify_payload
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
     MechanicalSystem,

@@ -7,7 +7,7 @@ from typing import Any
 
 from lightning.fabric.plugins import TorchCheckpointIO
 
-from pinn_dyn.data.whole import save_whole
+from pinn_dyn.whole import save_whole
 
 
 class WholeCheckpoints(TorchCheckpointIO):

@@ -7,7 +7,7 @@ import pytest
 
 from pinn_dyn.app.gather import read_runs, read_test_errors
 from pinn_dyn.data import StoredSource, whole
-from pinn_dyn.evaluation.identification import read_constants
+from pinn_dyn.identification.constants import read_constants
 from pinn_dyn.run.run_folder import load_run
 from pinn_dyn.run.validation import ConfigError
 

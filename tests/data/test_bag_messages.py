@@ -14,8 +14,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pinn_dyn.data.logs import LogError, Request
-from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.readers import find_files
+from pinn_dyn.data.logs.readers.bags import read_bag
 from tests.data.log_formats import STORE, STORE1
 from tests.data.logs_files import motion
 

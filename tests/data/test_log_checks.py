@@ -15,7 +15,7 @@ from pinn_dyn.data.logs import (
     Resample,
     RowClock,
 )
-from pinn_dyn.data.logs.checks import _are_ticks
+from pinn_dyn.data.logs.check.checks import _are_ticks
 from pinn_dyn.data.logs.registers import rows_before_first_sample
 from tests.data.logs_files import motion, source, write
 

@@ -15,8 +15,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from pinn_dyn.data.logs import READERS, LogError, LogSource, Request, Resample
-from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.columns import to_si
+from pinn_dyn.data.logs.readers.bags import read_bag
 from tests.data import log_formats as formats
 from tests.data.logs_files import arrays_of, assert_read, motion, named, source
 

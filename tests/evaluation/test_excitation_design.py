@@ -10,9 +10,9 @@ import yaml
 from scipy.interpolate import BPoly
 
 import pinn_dyn
-from pinn_dyn.evaluation.designed_motion import DesignedMotion
-from pinn_dyn.evaluation.motion_limits import Envelope, MotionLimits
-from pinn_dyn.evaluation.rigid_excitation import motion_excitation
+from pinn_dyn.identification.designed_motion import DesignedMotion
+from pinn_dyn.identification.motion_limits import Envelope, MotionLimits
+from pinn_dyn.identification.rigid_excitation import motion_excitation
 from pinn_dyn.systems import RigidChain
 from tests.support.rigid_chains import joint, link, robot
 
@@ -109,7 +109,7 @@ def intervals(q, v, a, tau):
     """Fit the base parameters by least squares; return their standard deviations."""
     chain = RigidChain(ARM)
     rows = chain.regressor(*map(torch.from_numpy, (q, v, a))).flatten(0, 1).numpy()
-    base = pinn_dyn.evaluation.rigid_excitation.base_parameters(rows)
+    base = pinn_dyn.identification.rigid_excitation.base_parameters(rows)
     rows = rows[:, base]
     _, cost, *_ = np.linalg.lstsq(rows, tau.ravel(), rcond=None)
     noise = cost[0] / (len(rows) - len(base))

@@ -23,9 +23,9 @@ from pinn_dyn.evaluation import (
     trajectory_figure,
 )
 from pinn_dyn.evaluation.figures import modes_figure
-from pinn_dyn.evaluation.plots import BASELINE, log_limits
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models.modes import modes_of
+from pinn_dyn.plots import BASELINE, log_limits
 from pinn_dyn.systems import SoftArm
 
 

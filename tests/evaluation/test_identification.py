@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.evaluation.identification import (
+from pinn_dyn.identification.constants import (
     common_factor,
     constants_table,
     contradicted,
     undetermined,
 )
-from pinn_dyn.evaluation.rigid_excitation import rigid_excitation
+from pinn_dyn.identification.rigid_excitation import rigid_excitation
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import AsymmetricCoulomb
 from pinn_dyn.run.fit_constants import write_constants

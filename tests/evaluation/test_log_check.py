@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data.logs import Butterworth, LogSource, MovingAverage, Recording
-from pinn_dyn.data.logs.averages import white_noise
-from pinn_dyn.evaluation.log_check import check
-from pinn_dyn.evaluation.log_numbers import bandwidth
+from pinn_dyn.data.logs.check.averages import white_noise
+from pinn_dyn.log_check.check import check
+from pinn_dyn.log_check.numbers import bandwidth
 from tests.support.delayed_robots import resting
 
 RATE = 100.0

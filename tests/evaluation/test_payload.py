@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.evaluation.payload import identify_payload
+from pinn_dyn.identification.payload import identify_payload
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.systems import RigidChain

@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from pinn_dyn.data.logs import RESIDUAL, LogSource
-from pinn_dyn.data.logs.runs import INERTIA
-from pinn_dyn.evaluation.log_check import check
-from pinn_dyn.evaluation.structure_check import SCALE
+from pinn_dyn.data.logs.check.runs import INERTIA
+from pinn_dyn.log_check.check import check
+from pinn_dyn.log_check.structure import SCALE
 from pinn_dyn.systems import RigidChain
 from tests.support import delayed_robots, underactuated
 from tests.support.random_chains import random_chain

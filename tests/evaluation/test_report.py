@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from pinn_dyn.evaluation.identification import COLUMNS
 from pinn_dyn.evaluation.report.page import slider
 from pinn_dyn.evaluation.report.prediction_page import prediction_report
+from pinn_dyn.identification.constants import COLUMNS
 from tests.evaluation.report_pages import (
     ODD,
     Page,

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pinn_dyn.data.logs import LogSource
-from pinn_dyn.evaluation.log_check import check
-from pinn_dyn.evaluation.rigid_excitation import base_columns, base_parameters, rigid_excitation
+from pinn_dyn.identification.rigid_excitation import base_columns, base_parameters, rigid_excitation
+from pinn_dyn.log_check.check import check
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import RigidChain
 from tests.support.delayed_robots import log, sines

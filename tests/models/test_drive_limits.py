@@ -18,8 +18,8 @@ from pinn_dyn.control import (
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.identification import constants_table
 from pinn_dyn.exports.c_file import find_compiler
+from pinn_dyn.identification.constants import constants_table
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, DriveLimits, KnownMechanics, LoadDependent, Servo
 from pinn_dyn.run.export import export

@@ -9,8 +9,8 @@ import torch
 from scipy.integrate import solve_ivp
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.identification import constants_table
-from pinn_dyn.evaluation.payload import identify_payload
+from pinn_dyn.identification.constants import constants_table
+from pinn_dyn.identification.payload import identify_payload
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory
 from pinn_dyn.models import ElasticJoints, KnownMechanics, Servo
 from pinn_dyn.systems import RigidChain

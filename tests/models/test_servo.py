@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.identification import constants_table
+from pinn_dyn.identification.constants import constants_table
 from pinn_dyn.mechanics import Rosenbrock, Signal, Trajectory
 from pinn_dyn.models import (
     ConstantCholesky,

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.identification import constants_table
+from pinn_dyn.identification.constants import constants_table
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import KnownMechanics
 from pinn_dyn.systems import RigidChain

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.identification import constants_table, undetermined
+from pinn_dyn.identification.constants import constants_table, undetermined
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.training import LeastSquares
 from tests.support.known import known_arm, known_cart_pole, motions

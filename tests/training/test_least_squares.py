@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.identification import constants_table
+from pinn_dyn.identification.constants import constants_table
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownSystem
 from pinn_dyn.training import LeastSquares, least_squares

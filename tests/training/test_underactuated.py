@@ -10,7 +10,7 @@ import pinn_dyn
 from pinn_dyn.control.laws import Regulation
 from pinn_dyn.control.stability import certify
 from pinn_dyn.data import draw_windows
-from pinn_dyn.evaluation.identification import constants_table, undetermined
+from pinn_dyn.identification.constants import constants_table, undetermined
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.models.learned_constants import Slopes

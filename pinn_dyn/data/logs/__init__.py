@@ -1,8 +1,15 @@
 """Logs of robots: readers, columns, units, cleaning steps, checks and the data source."""
 
+from pinn_dyn.data.logs.check.delay import DelayCurve, clear_delays, input_delays
+from pinn_dyn.data.logs.check.runs import (
+    INERTIA,
+    RESIDUAL,
+    Equation,
+    check_runs,
+    equations_of_motion,
+)
 from pinn_dyn.data.logs.clock import Deduplicate, InputDelay, Resample, SplitGaps
 from pinn_dyn.data.logs.columns import UNITS, Columns
-from pinn_dyn.data.logs.delay import DelayCurve, clear_delays, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
     Butterworth,
@@ -15,7 +22,6 @@ from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned
 from pinn_dyn.data.logs.readers import READERS
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.runs import INERTIA, RESIDUAL, Equation, check_runs, equations_of_motion
 from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.special_steps import (
     InterpolateHeld,

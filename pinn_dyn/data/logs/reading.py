@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.logs.checks import check_clock, check_rows
+from pinn_dyn.data.logs.check.checks import check_clock, check_rows
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.filling import fill

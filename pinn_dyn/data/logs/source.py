@@ -13,7 +13,9 @@ import numpy as np
 import pandas as pd
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from pinn_dyn.data.logs import plausibility
+from pinn_dyn.data.logs.check import plausibility
+from pinn_dyn.data.logs.check.repeats import check_repeats
+from pinn_dyn.data.logs.check.runs import check_runs, equations_of_motion
 from pinn_dyn.data.logs.cleaning import clean, long_enough
 from pinn_dyn.data.logs.clock import InputDelay
 from pinn_dyn.data.logs.columns import UNITS, Columns, validated
@@ -22,8 +24,6 @@ from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
 from pinn_dyn.data.logs.reading import Layout
 from pinn_dyn.data.logs.recording import Recording, Report
-from pinn_dyn.data.logs.repeats import check_repeats
-from pinn_dyn.data.logs.runs import check_runs, equations_of_motion
 from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.step import Step

@@ -130,3 +130,9 @@ class Table:
             raise LogError(f"{location}: expected the name of a run")
         names = names.astype(str)
         return {run: (names == run).to_numpy() for run in names.unique()}
+
+
+def alternates(x: np.ndarray) -> bool:
+    """Return true for numbers ``(T,)`` that go to and fro, as those of two sources by turns."""
+    one_row, two_rows = (float(np.median(np.abs(x[n:] - x[:-n]))) for n in (1, 2))
+    return one_row > 0.02 * np.ptp(x) and two_rows < 0.2 * one_row

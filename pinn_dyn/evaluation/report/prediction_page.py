@@ -13,7 +13,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.calibration import Calibration
 from pinn_dyn.evaluation.figures import (
     ERROR,
@@ -23,9 +22,7 @@ from pinn_dyn.evaluation.figures import (
     terms_figure,
     trajectory_figure,
 )
-from pinn_dyn.evaluation.identification import OPEN
 from pinn_dyn.evaluation.learned_terms import TermComparison
-from pinn_dyn.evaluation.plots import save
 from pinn_dyn.evaluation.prediction import Prediction
 from pinn_dyn.evaluation.report.page import (
     Section,
@@ -44,8 +41,11 @@ from pinn_dyn.evaluation.tables import (
     with_unit,
     write_table,
 )
+from pinn_dyn.identification.constants import OPEN
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.modes import Modes
+from pinn_dyn.plots import save
+from pinn_dyn.whole import write_whole
 
 SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
 MAX_TRAJECTORIES = 20

@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 from torch import Tensor, nn
 
-from pinn_dyn.evaluation.identification import OPEN, constants_covariance
+from pinn_dyn.identification.constants import OPEN, constants_covariance
 from pinn_dyn.mechanics import Signal, Trajectory, double_copy
 from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.models.known import INERTIAL

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pinn_dyn.data.logs.averages import Averages
+from pinn_dyn.data.logs.check.averages import Averages
+from pinn_dyn.data.logs.check.delay import FEWEST, DelayCurve, force_columns
+from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression, Regressor
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay import FEWEST, DelayCurve, force_columns
-from pinn_dyn.data.logs.equation import EquationOfMotionRegression, Regressor
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 

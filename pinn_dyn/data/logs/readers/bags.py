@@ -16,10 +16,9 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.cache import load_or_make
-from pinn_dyn.data.logs.checks import alternates
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.messages import open_bag
-from pinn_dyn.data.logs.table import Request, Table
+from pinn_dyn.data.logs.readers.messages import open_bag
+from pinn_dyn.data.logs.table import Request, Table, alternates
 
 # Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
 _NAMES = ("name", "joint_names", "interface_names")

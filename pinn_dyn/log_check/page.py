@@ -13,11 +13,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from pinn_dyn.data import logs
-from pinn_dyn.data.logs.averages import PARTS, Averages
+from pinn_dyn.data.logs.check.averages import PARTS, Averages
 from pinn_dyn.data.logs.measurement import Measurement
-from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.log_figures import cleaning_figure
-from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels
 from pinn_dyn.evaluation.report.page import (
     Section,
     details,
@@ -28,7 +26,9 @@ from pinn_dyn.evaluation.report.page import (
     preformatted,
     table,
 )
-from pinn_dyn.evaluation.rigid_excitation import RigidExcitation
+from pinn_dyn.identification.rigid_excitation import RigidExcitation
+from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels
+from pinn_dyn.whole import write_whole
 
 _ROWS = 50  # of a table in the terminal
 _RANK = {"stop": 0, "warning": 1, "ok": 2}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinn_dyn.data.logs.averages import Averages
+from pinn_dyn.data.logs.check.averages import Averages
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Maps q, v, a ``(R, N)`` to the Y ``(R, N, P)`` of rigid bodies: their torque is Y pi."""

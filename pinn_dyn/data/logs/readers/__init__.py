@@ -17,12 +17,19 @@ from pathlib import Path
 
 import pandas as pd
 
-from pinn_dyn.data.logs.arrays import read_hdf5, read_json, read_mat, read_npy, read_npz, read_torch
-from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.parquet import read_parquet
+from pinn_dyn.data.logs.readers.arrays import (
+    read_hdf5,
+    read_json,
+    read_mat,
+    read_npy,
+    read_npz,
+    read_torch,
+)
+from pinn_dyn.data.logs.readers.bags import read_bag
+from pinn_dyn.data.logs.readers.parquet import read_parquet
+from pinn_dyn.data.logs.readers.text import read_text
 from pinn_dyn.data.logs.table import Request, Table
-from pinn_dyn.data.logs.text import read_text
 
 Reader = Callable[[Path, Request], "pd.DataFrame | Table | Mapping[str, pd.DataFrame | Table]"]
 """Function that reads a file, or the runs of a file by name.

@@ -21,7 +21,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs.columns import known_unit
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.motion_capture import one_header
+from pinn_dyn.data.logs.readers.motion_capture import one_header
 from pinn_dyn.data.logs.table import Request, Table, vector_columns
 
 _SAMPLE = 300  # lines from which the dialect and the header are detected

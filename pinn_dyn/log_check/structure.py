@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from pinn_dyn.data.logs import Columns, DelayCurve, Recording, clear_delays
-from pinn_dyn.data.logs.averages import Averages
-from pinn_dyn.data.logs.delay import force_columns
-from pinn_dyn.data.logs.equation import EquationOfMotionRegression, Regressor
-from pinn_dyn.data.logs.input_faults import delayed
+from pinn_dyn.data.logs.check.averages import Averages
+from pinn_dyn.data.logs.check.delay import force_columns
+from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression, Regressor
+from pinn_dyn.data.logs.check.input_faults import delayed
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.models.structure import Structure
 from pinn_dyn.systems import RigidChain

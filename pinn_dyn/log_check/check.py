@@ -12,14 +12,14 @@ import pandas as pd
 from pydantic import PositiveFloat
 
 from pinn_dyn.data import logs
-from pinn_dyn.data.logs.averages import white_noise
-from pinn_dyn.data.logs.delay import INTERVAL
-from pinn_dyn.data.logs.input_faults import input_faults
+from pinn_dyn.data.logs.check.averages import white_noise
+from pinn_dyn.data.logs.check.delay import INTERVAL
+from pinn_dyn.data.logs.check.input_faults import input_faults
 from pinn_dyn.data.logs.measurement import Measurement, judged
-from pinn_dyn.evaluation import log_numbers as numbers
-from pinn_dyn.evaluation.report.check_page import LogCheck
-from pinn_dyn.evaluation.rigid_excitation import MOST, RigidExcitation, rigid_excitation
-from pinn_dyn.evaluation.structure_check import compare_structure, regressor
+from pinn_dyn.identification.rigid_excitation import MOST, RigidExcitation, rigid_excitation
+from pinn_dyn.log_check import numbers
+from pinn_dyn.log_check.page import LogCheck
+from pinn_dyn.log_check.structure import compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure
 

@@ -13,9 +13,9 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pinn_dyn.evaluation.plots import COLORS, legend_below, panels, save
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import KnownMechanics
+from pinn_dyn.plots import COLORS, legend_below, panels, save
 from pinn_dyn.training.filtered_motion import filtered_motion
 
 _PER_PERIOD = 2.0  # samples in a period of the cutoff, which are all but independent

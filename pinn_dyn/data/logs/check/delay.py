@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinn_dyn.data.logs.averages import Averages, with_products
-from pinn_dyn.data.logs.equation import EquationOfMotionRegression, Regressor, terms
+from pinn_dyn.data.logs.check.averages import Averages, with_products
+from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression, Regressor, terms
 from pinn_dyn.data.logs.recording import Recording
 
 _WIDTHS = (0.005, 0.01, 0.02, 0.04, 0.08)  # of the kernel, s

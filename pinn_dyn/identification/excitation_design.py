@@ -11,9 +11,13 @@ import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from pinn_dyn.evaluation.designed_motion import DesignedMotion
-from pinn_dyn.evaluation.motion_limits import Envelope, JointValues, MotionLimits
-from pinn_dyn.evaluation.rigid_excitation import base_columns, drive_regressor, motion_excitation
+from pinn_dyn.identification.designed_motion import DesignedMotion
+from pinn_dyn.identification.motion_limits import Envelope, JointValues, MotionLimits
+from pinn_dyn.identification.rigid_excitation import (
+    base_columns,
+    drive_regressor,
+    motion_excitation,
+)
 from pinn_dyn.progress import Progress
 from pinn_dyn.systems import RigidChain
 
@@ -45,8 +49,8 @@ def design_excitation(
 
     with w = 2 pi / duration. The motion starts and ends at rest at ``start``, with zero
     acceleration: sum_l a_il = 0 and sum_l l b_il = 0. W includes armatures and friction, see
-    :func:`~pinn_dyn.evaluation.rigid_excitation.motion_excitation`; the condition number is that of
-    columns of unit norm, and in the determinant a torque counts in units of its limit.
+    :func:`~pinn_dyn.identification.rigid_excitation.motion_excitation`; the condition number is
+    that of columns of unit norm, and in the determinant a torque counts in units of its limit.
 
     Each joint is scaled to its limits of position, velocity and acceleration. Limits of the torque,
     by the inertias of the URDF without friction, and the height of the tip are penalized. Adam

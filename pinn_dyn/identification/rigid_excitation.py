@@ -10,7 +10,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.evaluation.identification import named_directions
+from pinn_dyn.identification.constants import named_directions
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.known import INERTIAL
 from pinn_dyn.models.structure import Structure

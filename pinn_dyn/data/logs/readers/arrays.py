@@ -19,7 +19,7 @@ import pandas as pd
 import torch
 
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.matlab import elements, matlab_variables
+from pinn_dyn.data.logs.readers.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional, vector_columns
 from pinn_dyn.spelling import did_you_mean
 

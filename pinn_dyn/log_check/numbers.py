@@ -8,9 +8,9 @@ import numpy as np
 import scipy
 
 from pinn_dyn.data.logs import DelayCurve, Recording
-from pinn_dyn.data.logs.averages import Averages
-from pinn_dyn.data.logs.equation import EquationOfMotionRegression
-from pinn_dyn.data.logs.input_faults import delayed
+from pinn_dyn.data.logs.check.averages import Averages
+from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression
+from pinn_dyn.data.logs.check.input_faults import delayed
 
 _LAGS = 30  # of a target that are tried
 _STILL = 0.01  # variance of a coordinate at rest as a share of the largest

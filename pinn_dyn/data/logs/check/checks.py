@@ -14,7 +14,7 @@ from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import clock_steps
 from pinn_dyn.data.logs.registers import check_registers
 from pinn_dyn.data.logs.stamps import SAMPLE_TIMES, Clock
-from pinn_dyn.data.logs.table import Table
+from pinn_dyn.data.logs.table import Table, alternates
 
 _GAP_FACTOR = 3.0  # sample times from which a distance between rows is a gap
 _BURSTS = 0.4  # share of rows right after the row before from which stamps come in bursts
@@ -154,12 +154,6 @@ def _check_angle(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.
             f"{table.place(1, name, 'q')}: rows go to and fro by {abs(q[1] - q[0]):.4g} {unit}: "
             "two runs share the clock; name the column that tells them apart in 'trajectory'"
         )
-
-
-def alternates(x: np.ndarray) -> bool:
-    """Return true for numbers ``(T,)`` that go to and fro, as those of two sources by turns."""
-    one_row, two_rows = (float(np.median(np.abs(x[n:] - x[:-n]))) for n in (1, 2))
-    return one_row > 0.02 * np.ptp(x) and two_rows < 0.2 * one_row
 
 
 def _jumps(

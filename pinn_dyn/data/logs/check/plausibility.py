@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from pinn_dyn.data.logs.averages import Averages
+from pinn_dyn.data.logs.check.averages import Averages
+from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.equation import EquationOfMotionRegression
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinn_dyn.data.logs.averages import PARTS, Averages
+from pinn_dyn.data.logs.check.averages import PARTS, Averages
+from pinn_dyn.data.logs.check.delay import DelayCurve, clear_delays, force_columns
+from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression, Regressor, terms
+from pinn_dyn.data.logs.check.input_faults import delayed
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay import DelayCurve, clear_delays, force_columns
-from pinn_dyn.data.logs.equation import EquationOfMotionRegression, Regressor, terms
-from pinn_dyn.data.logs.input_faults import delayed
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 

@@ -1,0 +1,1 @@
+"""Checks of a log: its clock, its values, its runs, and its inputs."""

@@ -1,0 +1,1 @@
+"""Identification of robots: motions that excite, constants with intervals, payload, adaptation."""

@@ -1,0 +1,1 @@
+"""Check of a log against mechanics: numbers, verdicts, figures and a page."""
