@@ -83,16 +83,7 @@ def read_urdf(
             that moves.
     """
     file = UrdfFile(urdf)
-    locked = dict.fromkeys(locked_joints, 0.0)
-    locked |= locked_joints if isinstance(locked_joints, Mapping) else {}
-    movable = [name for name in file.order if file.moves(name) and name not in locked]
-    if joints is None:
-        joints = [name for name in movable if file.drive(name)[0] == name]
-    for key, names, allowed in (("locked_joints", locked, file.order), ("joints", joints, movable)):
-        if wrong := [name for name in names if name not in allowed or [*names].count(name) > 1]:
-            raise ValueError(f"{file.path}: {key} has {wrong}, expected once each of {allowed}")
-    if not joints:
-        raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked)})")
+    joints, movable, locked = _joints(file, joints, locked_joints)
     children = [file.ends[name][1] for name in file.joints]
     if tip is None:
         tip = [name for name in children if not file.after(name)][-1]
@@ -131,7 +122,7 @@ def read_urdf(
         visit(root, -1, np.eye(4))
     return Tree(
         path=file.path,
-        joints=list(joints),
+        joints=joints,
         movable=movable,
         locked=locked,
         bodies=[file.ends[name][1] for name in moving],
@@ -149,6 +140,25 @@ def read_urdf(
         unread=[note.text or "" for note in file.robot.findall("note")],
         problems=file.problems,
     )
+
+
+def _joints(
+    file: UrdfFile,
+    joints: Sequence[str] | None,
+    locked_joints: Sequence[str] | Mapping[str, float],
+) -> tuple[list[str], list[str], dict[str, float]]:
+    """Return the joints of the coordinates, all that move, and the values of locked joints."""
+    locked = dict.fromkeys(locked_joints, 0.0)
+    locked |= locked_joints if isinstance(locked_joints, Mapping) else {}
+    movable = [name for name in file.order if file.moves(name) and name not in locked]
+    if joints is None:
+        joints = [name for name in movable if file.drive(name)[0] == name]
+    for key, names, allowed in (("locked_joints", locked, file.order), ("joints", joints, movable)):
+        if wrong := [name for name in names if name not in allowed or [*names].count(name) > 1]:
+            raise ValueError(f"{file.path}: {key} has {wrong}, expected once each of {allowed}")
+    if not joints:
+        raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked)})")
+    return list(joints), movable, locked
 
 
 def urdf_text(urdf: str) -> str:

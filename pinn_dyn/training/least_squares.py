@@ -186,28 +186,8 @@ class LeastSquares:
             prior = Prior(torch.where(held, absent.double(), prior.mean), root @ prior.root)
             vector_to_parameters(prior.mean, model.parameters())
         earlier = covariance is not None
-        growth: list[Windows] = []
-        stages = {}
-        if not self.rollouts or model.identified_by_forces:
-            stages[IDENTIFICATION] = partial(self._identify, model, prior, trajectories, earlier)
-        if self.rollouts:
-            assert windows is not None
-            windows = windows.to(torch.device("cpu"), torch.float64)
-            steps, size = len(windows.t) - 1, len(windows) * model.num_coordinates
-            source = f"{len(windows)} windows of {steps} steps"
-            remedy = "use more windows (data.pairs) or longer windows (data.steps)"
-            residuals = size * _informative_blocks(steps) * steps
-            _require_enough(residuals, count, source, remedy, earlier)
-            # Short windows first: from a poor start, long windows diverge or end in a poor minimum.
-            short = -(-steps // 4)
-            enough = size * _informative_blocks(short) * short >= count
-            lengths = [short, steps] if enough and short < steps else [steps]
-            parts = [windows.first(length) for length in lengths]
-            growth = [] if validate is None else _longer(trajectories, windows)
-            for part in [*parts, *growth]:
-                name = f"rollouts of {float(part.t[-1]):.3g} s"
-                stages[name] = partial(self._roll_out, name, model, prior, part)
-        planned = len(stages) - len(growth)
+        may_grow = validate is not None
+        stages, planned = self._stages(model, prior, trajectories, windows, earlier, may_grow)
         best, number = stopped, (stopped.stopped_in or 0) if stopped else 0
         lowest = best.errors if best else UNKNOWN
         identified = best.identified if best else None
@@ -244,6 +224,40 @@ class LeastSquares:
         if validate is not None and len(stages) > 1:
             log.info("least squares keeps %s: validation errors %s", best.stage, ", ".join(texts))
         return replace(best, stopped_in=None, identified=identified)
+
+    def _stages(
+        self,
+        model: LearnedConstants,
+        prior: Prior,
+        trajectories: Sequence[Trajectory],
+        windows: Windows | None,
+        earlier: bool,
+        may_grow: bool,
+    ) -> tuple[dict[str, Callable[[], Fit]], int]:
+        """Return the stages by name, and the number of those before the windows grow."""
+        stages: dict[str, Callable[[], Fit]] = {}
+        if not self.rollouts or model.identified_by_forces:
+            stages[IDENTIFICATION] = partial(self._identify, model, prior, trajectories, earlier)
+        if not self.rollouts:
+            return stages, len(stages)
+        assert windows is not None
+        windows = windows.to(torch.device("cpu"), torch.float64)
+        count = sum(p.numel() for p in model.parameters())
+        steps, size = len(windows.t) - 1, len(windows) * model.num_coordinates
+        source = f"{len(windows)} windows of {steps} steps"
+        remedy = "use more windows (data.pairs) or longer windows (data.steps)"
+        residuals = size * _informative_blocks(steps) * steps
+        _require_enough(residuals, count, source, remedy, earlier)
+        # Short windows first: from a poor start, long windows diverge or end in a poor minimum.
+        short = -(-steps // 4)
+        enough = size * _informative_blocks(short) * short >= count
+        lengths = [short, steps] if enough and short < steps else [steps]
+        parts = [windows.first(length) for length in lengths]
+        planned = len(stages) + len(parts)
+        for part in [*parts, *(_longer(trajectories, windows) if may_grow else [])]:
+            name = f"rollouts of {float(part.t[-1]):.3g} s"
+            stages[name] = partial(self._roll_out, name, model, prior, part)
+        return stages, planned
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
         z, names = parameters_to_vector(model.parameters()).detach(), model.parameter_names()
