@@ -28,7 +28,7 @@ import torch
 from configured import build_model
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.config import CONF, plain
+from pinn_dyn.app.config import CONF, resolved
 from pinn_dyn.control import Tracking, export_law
 from pinn_dyn.control.export import INPUTS
 from pinn_dyn.mechanics import MechanicalSystem
@@ -53,7 +53,7 @@ Call = tuple[Callable[..., Any], list[Any]]
 def untrained() -> MechanicalSystem:
     """Return an untrained network of the size of the Panda experiment, with unit scales."""
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        config = plain(compose("train", overrides=["experiment=panda", "model_name=lnn"]))
+        config = resolved(compose("train", overrides=["experiment=panda", "model_name=lnn"]))
     one, increment = torch.ones(JOINTS), torch.ones(1, 2 * JOINTS)
     torch.manual_seed(0)
     statistics = Statistics(

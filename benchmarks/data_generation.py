@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.config import CONF, plain
+from pinn_dyn.app.config import CONF, resolved
 from pinn_dyn.data import SimulatedSource
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Signal, Trajectory
@@ -67,7 +67,7 @@ def main() -> None:
     torch.set_num_threads(1)
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         overrides = [f"dataset={arguments.dataset}", "model_name=none"]
-        config = plain(compose("train", overrides=overrides))
+        config = resolved(compose("train", overrides=overrides))
     source = build_source(config)
     assert isinstance(source, SimulatedSource)
 

@@ -30,7 +30,7 @@ import torch
 from configured import build_data, build_learner, build_model, build_validator
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.config import CONF, plain
+from pinn_dyn.app.config import CONF, resolved
 from pinn_dyn.data import DynamicsData, LightningData
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Predictor, Trajectory, stack
@@ -170,7 +170,7 @@ def main() -> None:
                 "compile=false",
             ]
             words = ["experiment=soft_arm_1", f"model={kind}", f"model_name={kind}", *short]
-            config = plain(compose("train", overrides=words))
+            config = resolved(compose("train", overrides=words))
         found = {}
         for side in ("ours", "paper"):
             part = config["data"] if side == "ours" else {**config["data"], "stride": 1}

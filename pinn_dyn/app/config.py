@@ -59,7 +59,7 @@ def completed(command: str, overrides: Sequence[str]) -> list[str]:
     ]
 
 
-def plain(cfg: DictConfig) -> dict[str, Any]:
+def resolved(cfg: DictConfig) -> dict[str, Any]:
     """Convert a configuration to nested dicts, lists and values, with interpolations resolved."""
     try:
         values = OmegaConf.to_container(cfg, resolve=True)
@@ -75,7 +75,7 @@ def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: with a line for each key that is missing or unknown, or has a wrong value.
     """
-    config = cfg if isinstance(cfg, dict) else plain(cfg)
+    config = cfg if isinstance(cfg, dict) else resolved(cfg)
     check_keys(SETTINGS[command], config)
     trainer = config.get("trainer")
     if isinstance(trainer, dict) and trainer.get("_target_") == "lightning.Trainer":

@@ -49,7 +49,7 @@ def certify(
     Raises:
         ValueError: on sizes that do not match, or N != M.
     """
-    model, truth, q = prepare(model, truth, q)
+    model, truth, q = float64_pair(model, truth, q)
     K_P = diagonal_gain("position_gain", position_gain, q.shape[-1]).to(q)
     K_D = diagonal_gain("velocity_gain", velocity_gain, q.shape[-1]).to(q)
     with torch.no_grad():
@@ -135,7 +135,7 @@ def term_conditions(model: MechanicalSystem, q: Tensor) -> pd.DataFrame:
     return per_configuration(q, columns)
 
 
-def prepare(
+def float64_pair(
     model: MechanicalSystem, truth: MechanicalSystem, q: Tensor
 ) -> tuple[MechanicalSystem, MechanicalSystem, Tensor]:
     """Return float64 copies of two systems and of configurations, after checking them."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.laws import Gain, diagonal_gain
-from pinn_dyn.control.stability import per_configuration, prepare, smallest_eigenvalue, solve
+from pinn_dyn.control.stability import float64_pair, per_configuration, smallest_eigenvalue, solve
 from pinn_dyn.mechanics import MechanicalSystem
 
 _DIFFERENCE = 1e-4  # step of the central differences, in the units of q
@@ -51,7 +51,7 @@ def predict_steady_state(
         - ``fastest_pole``: largest absolute value of the poles, 1/s;
         - ``holds``: true where the bound is finite, condition 1 holds, and the loop is stable.
     """
-    model, truth, q_ref = prepare(model, truth, q_ref)
+    model, truth, q_ref = float64_pair(model, truth, q_ref)
     K_P = diagonal_gain("position_gain", position_gain, q_ref.shape[-1]).to(q_ref)
     K_D = diagonal_gain("velocity_gain", velocity_gain, q_ref.shape[-1]).to(q_ref)
 
@@ -87,7 +87,7 @@ def required_gain(
 
     with L_w the largest |dw/dq| over the ball of radius 1.05 ``error`` around q_ref.
     """
-    model, truth, q_ref = prepare(model, truth, q_ref)
+    model, truth, q_ref = float64_pair(model, truth, q_ref)
     w = partial(_input_error, model, truth)
     with torch.no_grad():
         radius = torch.full_like(q_ref[:, 0], _SLACK * error)

@@ -17,7 +17,7 @@ _ITERATIONS = 7  # of reweighted least squares
 
 
 @dataclass(frozen=True)
-class Fit:
+class WeightedFit:
     """Result of S weighted least-squares fits of K columns y to P columns X.
 
     Attributes:
@@ -83,7 +83,7 @@ class EquationOfMotionRegression:
         count = len(self.numbers)
         return np.vstack([np.ones(count), 1 - np.eye(count)])
 
-    def fit(self, y: str, x: Sequence[str], weights: np.ndarray | None = None) -> Fit:
+    def fit(self, y: str, x: Sequence[str], weights: np.ndarray | None = None) -> WeightedFit:
         """Fit the columns ``y`` to the columns ``x``, with weights ``(S, B)``; None are ones."""
         weights = np.ones((1, len(self.numbers))) if weights is None else weights
         terms, target = np.concatenate([self.index[name] for name in x]), self.index[y]
@@ -96,7 +96,7 @@ class EquationOfMotionRegression:
         squares = totals - 2 * np.einsum("spk,bpk->sbk", theta, cross)
         squares = squares + np.einsum("spk,sbpk->sbk", theta, gram[None] @ theta[:, None])
         scale = self.scale[target]
-        return Fit(
+        return WeightedFit(
             theta * scale / self.scale[terms][:, None],
             weights,
             squares.clip(min=0) * scale**2,
@@ -123,7 +123,7 @@ class EquationOfMotionRegression:
         usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0))
         return means / usual.clip(min=1e-300)
 
-    def residuals(self, fit: Fit) -> np.ndarray:
+    def residuals(self, fit: WeightedFit) -> np.ndarray:
         """Return the residual of each block, ``(B, K)``, as a share of its root mean square of y.
 
         The share is that of the median block if that block has a larger y.
