@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 
+from pinn_dyn.data.bandwidth import samples_in_step
 from pinn_dyn.data.lengths import seconds_of
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.data.windows import Windows, draw_windows
@@ -26,6 +27,8 @@ class DynamicsData:
             used if there are fewer.
         steps: steps H of a window; 1 gives the paper's transition pairs.
         stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``.
+            ``"auto"`` is about a tenth of a period of the fastest input, or of the fastest motion
+            if that is slower.
         batch_size: windows in a batch.
         batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.
@@ -60,9 +63,17 @@ class DynamicsData:
     def step(self) -> float:
         """Step of a window, s."""
         t = self.splits.train[0].t
-        return self._samples() * float(t[1] - t[0])
+        return self._samples * float(t[1] - t[0])
 
+    @functools.cached_property
     def _samples(self) -> int:
+        if self.stride == "auto":
+            runs = self.splits.train
+            sample_time = float(runs[0].t[1] - runs[0].t[0])
+            inputs, motions = [x.u.numpy() for x in runs], [x.q.numpy() for x in runs]
+            count = samples_in_step([inputs, motions], sample_time)
+            log.info("data.stride=auto is %.4g ms", 1e3 * count * sample_time)
+            return count
         if isinstance(self.stride, str):
             length = seconds_of("stride", self.stride)
             return samples_of("stride", length, self.splits.train[0].t)
@@ -75,7 +86,7 @@ class DynamicsData:
         Raises:
             ValueError: on a batch larger than the number of windows.
         """
-        runs, stride, count = self.splits.train, self._samples(), self.pairs
+        runs, stride, count = self.splits.train, self._samples, self.pairs
         starts = sum(max(len(x.t) - self.steps * stride, 0) for x in runs)
         if count != "all" and 0 < starts < count:
             log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)

@@ -12,6 +12,7 @@ import pandas as pd
 from pydantic import PositiveFloat
 
 from pinn_dyn.data import logs
+from pinn_dyn.data.bandwidth import bandwidth
 from pinn_dyn.data.logs.check.averages import white_noise
 from pinn_dyn.data.logs.check.delay import INTERVAL
 from pinn_dyn.data.logs.check.input_faults import input_faults
@@ -29,11 +30,6 @@ _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
 _OF_MOTORS = {"rad", "m", "Pa"}  # units of motor angles, lengths of tendons, and pressures
 # Settings that were the best on a real trunk, docs/what_we_tried.md.
-_LATENT = [
-    *("data.steps=40", "loss.velocity_weight=0.1", "optimizer.lr=0.012"),
-    *("optimizer.weight_decay=0.05", "trainer.steps=1200", "trainer.validations=8"),
-]
-_STEPS = [x * 10.0**k for k in (-3, -2, -1) for x in (1, 2, 5)]  # s
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
 # Column of the table of coordinates, its upper limit, and the text beyond it.
 _LIMITS = (
@@ -78,7 +74,8 @@ def check(
     runs = [] if any(x.verdict != "ok" for x in faults) else runs
     before = [x for x in source.measurements if x.name not in {logs.RESIDUAL, logs.INERTIA}]
     coordinates = _coordinates(source, training, splits.test)
-    highest = numbers.bandwidth(training, step, coordinates["noise of q"].to_numpy())
+    noise = coordinates["noise of q"].to_numpy()
+    highest = bandwidth([item.q for item in training], step, noise)
     servo = _follows_targets(source, training, step, longest_delay)
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else logs.clear_delays(delays, step)
@@ -98,7 +95,7 @@ def check(
     options += ["model/friction=coulomb"] * dry
     motors = structure is None and not servo and set(source.u.units[:inputs]) <= _OF_MOTORS
     if motors:
-        options = _latent_windows(training, step)
+        options = ["experiment=oscillators"]
     return LogCheck(
         source=source,
         measurements=measurements,
@@ -122,16 +119,6 @@ def _follows_targets(
     """Tell whether the inputs are targets that the coordinates follow."""
     same_units = source.u.units[: len(source.q.units)] == source.q.units
     return same_units and numbers.target_distance(training, step, longest) < _TARGET
-
-
-def _latent_windows(training: list[logs.Recording], step: float) -> list[str]:
-    """Return options of oscillators, with about ten steps in a period of the fastest input."""
-    inputs = [replace(item, q=item.u) for item in training]
-    fastest = numbers.bandwidth(inputs, step, np.zeros(training[0].u.shape[1]))
-    longest = 0.1 / max(fastest, 0.1)
-    round_numbers = [x for x in _STEPS if x >= 0.99 * longest and abs(x / step % 1 - 0.5) > 0.49]
-    stride = round_numbers[0] if round_numbers else max(round(longest / step), 1) * step
-    return [f"data.stride={1e3 * stride:.6g} ms", *_LATENT]
 
 
 def _inputs_measured(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy
 
 from pinn_dyn.data.logs import DelayCurve, Recording
 from pinn_dyn.data.logs.check.averages import Averages
@@ -65,15 +64,3 @@ def target_distance(training: Sequence[Recording], step: float, longest: float) 
         parts = [item.q[lag:] - item.u[: len(item) - lag, :size] for item in training]
         shares.append(np.vstack(parts).var(axis=0) / spread)
     return float(np.min(shares, axis=0).max())
-
-
-def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> float:
-    """Return the frequency in Hz below which 99 % of the power of v is, above the noise of q."""
-    size = min(round(8 / step), min(len(item) for item in training))
-    spectra = [scipy.signal.welch(item.q, 1 / step, nperseg=size, axis=0) for item in training]
-    f, density = spectra[0][0], np.mean([power for _, power in spectra], axis=0)
-    # White noise has 2 s² h per Hz. Power up to four times this level counts as noise.
-    level = np.maximum(2 * noise**2 * step, np.median(density[len(f) // 2 :], axis=0))
-    power = np.where(density > 4 * level, density, 0.0) * f[:, None] ** 2
-    share = np.cumsum(power, axis=0) / power.sum(axis=0).clip(min=1e-300)
-    return max((float(f[np.searchsorted(x, 0.99)]) for x in share.T if x[-1] > 0), default=0.0)

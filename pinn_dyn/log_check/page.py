@@ -55,8 +55,8 @@ class LogCheck:
         delays: delay curve of each input.
         steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
         delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
-        options: options of a training: heads for dry friction or servos, or windows of oscillators,
-            if needed; none if an angle turns too far in a sample for a step.
+        options: options of a training: heads for dry friction or servos, or the settings of
+            oscillators, if needed; none if an angle turns too far in a sample for a step.
         model: model of a training: oscillators for inputs that are positions or pressures of
             motors, which the coordinates do not follow, of a robot without a structure; else lnn.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
@@ -86,9 +86,9 @@ class LogCheck:
     @property
     def advice(self) -> str:
         """Model and options of a training."""
-        options = f"model={self.model} {shlex.join(self.options)}"
+        options = shlex.join(self.options)
         if self.model == "lnn":
-            return f"Options of a training: {options}"
+            return f"Options of a training: model=lnn {options}"
         return (
             "The inputs are positions or pressures of motors, no forces: a soft robot has more "
             f"modes than coordinates. Options of a training: {options}"

@@ -71,10 +71,10 @@ STEPS, LOG_STEPS = 20_000, 1000
 """Default steps of the optimizer on simulated data and on a log."""
 _PAIRS, _BATCH = 10_000, 128  # at most, of a log
 _WINDOW, _STEP = 2, 0.02  # steps of a training window of a log, and their length in s
-_FEW_PAIRS, _LONG_WINDOW = (
-    150,
-    10,
-)  # pairs for least squares, and steps for it, subnet and oscillators
+_FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs for least squares, and steps for it and subnet
+_LATENT_WINDOW = 40  # steps, for oscillators
+_LATENT_LOSS = partial(IncrementLoss, velocity_weight=0.1)  # v is derived from q
+_LATENT_OPTIMIZER = partial(AdamW, lr=0.012, weight_decay=0.05, fused=True)
 _HISTORY = 0.5  # s of the past, for subnet
 _COLUMNS = [
     "name",
@@ -96,8 +96,8 @@ def train(
     source: DataSource,
     model: str | ModelBuilder | Predictor,
     *,
-    loss: str | Callable[..., WindowLoss] = IncrementLoss,
-    optimizer: Callable[..., Optimizer] | LeastSquares = ADAMW,
+    loss: str | Callable[..., WindowLoss] | None = None,
+    optimizer: Callable[..., Optimizer] | LeastSquares | None = None,
     scheduler: Callable[..., LRScheduler] = one_cycle,
     data: Callable[..., DynamicsData] | None = None,
     validator: Callable[..., RolloutValidator] = RolloutValidator,
@@ -133,12 +133,13 @@ def train(
             ``"mlp"``, ``"subnet"`` or ``"oscillators"``; or a built predictor, which is trained in
             place.
         loss: builder, called with ``statistics=`` and ``model=``; or ``"increment"`` or
-            ``"midpoint"``.
-        optimizer: builder, called with the parameters; or a least-squares fit.
+            ``"midpoint"``; None takes the increment loss.
+        optimizer: builder, called with the parameters; or a least-squares fit; None takes AdamW.
         scheduler: builder, called with the optimizer and ``total_steps=``.
         data: builder of the training windows, called with ``source=``; None takes windows of two
-            steps of about 20 ms from a log (ten for least squares, subnet and oscillators), and the
-            defaults of :class:`~pinn_dyn.data.DynamicsData` from other sources.
+            steps of about 20 ms from a log (ten for least squares and subnet), and the defaults of
+            :class:`~pinn_dyn.data.DynamicsData` from other sources. Oscillators have 40 steps of
+            about a tenth of a period of the fastest input or motion.
         validator: builder of the validation, called with ``training_step=``.
         steps: steps of the optimizer; None takes 1,000 on a log and 20,000 on other sources.
         validations: number of validations, a divisor of ``steps``; None takes up to 10 on a log
@@ -167,6 +168,9 @@ def train(
         temporary = TemporaryDirectory(prefix="pinn_dyn-")
         folder, callbacks = temporary.name, callbacks or ()
     run_folder = Path(folder).expanduser()
+    latent = model == "oscillators"
+    loss = loss or (_LATENT_LOSS if latent else IncrementLoss)
+    optimizer = optimizer or (_LATENT_OPTIMIZER if latent else ADAMW)
     steps, validations, trainer = _length(source, optimizer, steps, validations, trainer)
     data = data or _windows(source, model, optimizer)
     model, model_name = _builder(source, model, model_name)
@@ -283,6 +287,9 @@ def _by_name(kind: str, value: Any, names: Mapping[str, Any]) -> Any:
 
 def _windows(source: DataSource, model: Any, optimizer: Any) -> Callable[..., DynamicsData]:
     """Return the builder of the default windows."""
+    if model == "oscillators":
+        windows = partial(DynamicsData, pairs=_PAIRS, batch_size=_BATCH)
+        return partial(windows, steps=_LATENT_WINDOW, stride="auto")
     if not isinstance(source, LogSource):
         return DynamicsData
     t = source.load().train[0].t
@@ -293,7 +300,7 @@ def _windows(source: DataSource, model: Any, optimizer: Any) -> Callable[..., Dy
     windows = partial(DynamicsData, pairs=pairs, steps=steps, stride=stride, batch_size=batch)
     if model == "subnet":
         return partial(windows, history=_HISTORY, steps=_LONG_WINDOW)
-    return partial(windows, steps=_LONG_WINDOW) if model == "oscillators" else windows
+    return windows
 
 
 def _model_description(model: Any) -> dict[str, Any]:

@@ -256,6 +256,18 @@ def test_a_stride_in_time_is_the_same_at_any_rate():
         make_data(stride="3 samples").windows  # noqa: B018
 
 
+@pytest.mark.parametrize("rate", [40, 500, 1000])
+@pytest.mark.parametrize(("fastest", "step"), [(1.5, 0.1), (3.0, 0.05), (8.0, 0.02)])
+def test_an_automatic_stride_is_a_tenth_of_a_period_at_any_rate(rate, fastest, step):
+    """In round times: 66.7, 33.3 and 12.5 ms."""
+    t = torch.arange(20 * rate, dtype=torch.float64) / rate
+    q = (2 * torch.pi * t[:, None] * torch.tensor([0.3, fastest])).sin()
+    white = torch.randn(q.shape, generator=torch.Generator().manual_seed(0)).double()
+    data = make_data(stride="auto")
+    data.splits = dataclasses.replace(data.splits, train=[Trajectory(q, q, Signal(t, white))])
+    assert data.step == pytest.approx(step, abs=0.3 / rate)
+
+
 def slow_in_the_middle(samples=60_000):
     """q = s^3 over s = -1 to 1: the density of the samples, ~ |q|^(-2/3), peaks at q = 0."""
     s = torch.linspace(-1, 1, samples, dtype=torch.float64).unsqueeze(-1)
