@@ -44,7 +44,7 @@ def check(cfg: DictConfig) -> None:
         options += _gains(report) if "model/input=servo" not in options else []
         print(f"a training of its constants: {_training(options, True)}")
     elif report.options and report.model == "oscillators":
-        print(f"a training: {_training(report.options, model=report.model)}")
+        print(f"a training: {_training(report.options)}")
         print("the modes, a control law and C code follow: docs/soft_robots.md")
     elif report.options:
         names = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
@@ -70,7 +70,7 @@ def _gains(report: LogCheck) -> list[str]:
     return [f"model.drive_gain=[{values}]", "model.gain_spread=0.5"]
 
 
-def _training(options: list[str], with_structure: bool = False, model: str = "lnn") -> str:
+def _training(options: list[str], with_structure: bool = False) -> str:
     """Return the command that trains a model on this data set, for a shell.
 
     The command identifies the structure that the check was called with, if ``with_structure``.
@@ -83,5 +83,8 @@ def _training(options: list[str], with_structure: bool = False, model: str = "ln
     parts.insert(parts[:1] == ["python"], str(name))
     if not any(x.startswith("dataset=") for x in parts):
         parts.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
-    chosen = ["experiment=known"] if with_structure else [f"model={model}", "data=multi_step"]
-    return shlex.join([*parts, *chosen, *options])
+    if with_structure:
+        options = ["experiment=known", *options]
+    elif "experiment=oscillators" not in options:
+        options = ["model=lnn", "data=multi_step", *options]
+    return shlex.join([*parts, *options])

@@ -139,7 +139,7 @@ def train(
         data: builder of the training windows, called with ``source=``; None takes windows of two
             steps of about 20 ms from a log (ten for least squares and subnet), and the defaults of
             :class:`~pinn_dyn.data.DynamicsData` from other sources. Oscillators have 40 steps of
-            about a tenth of a period of the fastest input or motion.
+            about a tenth of a period of the fastest input or motion, fewer on short runs.
         validator: builder of the validation, called with ``training_step=``.
         steps: steps of the optimizer; None takes 1,000 on a log and 20,000 on other sources.
         validations: number of validations, a divisor of ``steps``; None takes up to 10 on a log
@@ -288,8 +288,10 @@ def _by_name(kind: str, value: Any, names: Mapping[str, Any]) -> Any:
 def _windows(source: DataSource, model: Any, optimizer: Any) -> Callable[..., DynamicsData]:
     """Return the builder of the default windows."""
     if model == "oscillators":
-        windows = partial(DynamicsData, pairs=_PAIRS, batch_size=_BATCH)
-        return partial(windows, steps=_LATENT_WINDOW, stride="auto")
+        windows = partial(DynamicsData, pairs=_PAIRS, batch_size=_BATCH, stride="auto")
+        step = windows(source=source, batches_per_epoch=1, seed=0).step
+        longest = max(item.duration for item in source.load().train)
+        return partial(windows, steps=max(1, min(_LATENT_WINDOW, int(longest / 2 / step))))
     if not isinstance(source, LogSource):
         return DynamicsData
     t = source.load().train[0].t

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
+import pinn_dyn
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs import Deduplicate, InputDelay, InputRates, Resample, SubtractStart
 from pinn_dyn.run.predict_frame import predict_frame
@@ -102,3 +103,12 @@ def test_a_model_of_fixed_steps_is_drawn_on_lines_between_them():
     np.testing.assert_allclose(found.x, frame.x[0] - 1000 * frame.t, atol=1e-9)
     with pytest.raises(ValueError, match=r"in steps of 0.04 s, no multiple of .* 0.03 s"):
         predict_frame(Still(), log(), motion(1).assign(t=np.arange(201) * 0.03))
+
+
+def test_oscillators_fit_a_short_log_by_default(tmp_path):
+    """Up to 0.5 Hz for 4 s: steps far longer than 20 ms, and windows of at most half a run."""
+    columns = dict(q=["x"], u=["f"], run="run", folder=tmp_path / "run")
+    run = pinn_dyn.fit(motion(3), **columns, model="oscillators", steps=1)
+    step = run.statistics.step
+    assert step > 0.05
+    assert 1 < run.config["data"]["steps"] * step <= 2
