@@ -6,19 +6,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+import scipy
 import torch
-from matplotlib.figure import Figure
-from scipy.signal import lfilter
 from torch import Tensor
 
 from pinn_dyn.control.observer import DisturbanceObserver, rest_speeds
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
-from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels, save
 from pinn_dyn.systems import RigidChain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _BLOCK = 10.0  # time constants of the observer in a block of independent maxima
 _FEWEST_BLOCKS = 10
@@ -54,6 +56,8 @@ class ExternalTorque:
 
     def figure(self, run: str | None = None) -> Figure:
         """Draw the torques of a run, the first by default, with thresholds and contacts."""
+        from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels  # imports matplotlib
+
         run = self.table["run"].iloc[0] if run is None else run
         rows = self.table[self.table["run"] == run]
         t, joints = rows["time"].to_numpy(), list(self.threshold.index)
@@ -79,6 +83,8 @@ class ExternalTorque:
 
     def save(self, path: str | Path) -> None:
         """Write the figure of the first run as PNG."""
+        from pinn_dyn.plots import save
+
         save(self.figure(), Path(path).expanduser())
 
 
@@ -97,7 +103,7 @@ def observed_torques(
         residual = observer.observe(q, v, u, period, hold=motion.input.interpolation == "hold")
         drive = observer._driven(q, v, u)
     gain = -math.expm1(-bandwidth * period)
-    filtered = lfilter([gain], [1, gain - 1], (drive - drive[0]).numpy(), axis=0)
+    filtered = scipy.signal.lfilter([gain], [1, gain - 1], (drive - drive[0]).numpy(), axis=0)
     return residual, drive[0] + torch.from_numpy(filtered)
 
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import KnownMechanics
-from pinn_dyn.plots import COLORS, legend_below, panels, save
 from pinn_dyn.training.filtered_motion import filtered_motion
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PER_PERIOD = 2.0  # samples in a period of the cutoff, which are all but independent
 _REST = 0.03  # speed in units of its spread, below which dry friction is unknown
@@ -38,6 +39,8 @@ class Adaptation:
 
     def figure(self, run: str | None = None) -> Figure:
         """Draw the constants of a run over time, the first run by default."""
+        from pinn_dyn.plots import COLORS, legend_below, panels  # imports matplotlib
+
         table = self.table
         run = table["run"].iloc[0] if run is None else run
         parts = dict(iter(table[table["run"] == run].groupby("name", sort=False)))
@@ -59,6 +62,8 @@ class Adaptation:
 
     def save(self, path: str | Path) -> None:
         """Write the figure of the first run as PNG."""
+        from pinn_dyn.plots import save
+
         save(self.figure(), Path(path).expanduser())
 
 

@@ -52,7 +52,7 @@ def _arguments(path: str) -> Arguments | None:
     """Return the arguments of a class or function; None if the source does not tell them all."""
     if kind := STAND_INS.get(path):
         path = f"{kind.__module__}.{kind.__qualname__}"
-    module, node = _definition(path)
+    module, node = definition(path)
     fields: list[ast.AnnAssign | ast.arg] = []
     arguments: Arguments = {}
     if isinstance(node, ast.ClassDef):
@@ -83,7 +83,7 @@ def _arguments(path: str) -> Arguments | None:
     return arguments
 
 
-def _definition(path: str) -> tuple[str, ast.AST | None]:
+def definition(path: str) -> tuple[str, ast.AST | None]:
     """Return the definition of a class or function, and its module; follow imports."""
     module, _, name = path.rpartition(".")
     while module and _spec(module) is None:
@@ -95,7 +95,7 @@ def _definition(path: str) -> tuple[str, ast.AST | None]:
             return module, node
     head, dot, tail = name.partition(".")
     target = f"{names[head]}{dot}{tail}" if head in names else path
-    return (path, None) if target == path else _definition(target)
+    return (path, None) if target == path else definition(target)
 
 
 @functools.cache

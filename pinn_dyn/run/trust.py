@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
+import ast
 import pkgutil
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
+from pinn_dyn.run.signatures import definition
 from pinn_dyn.run.validation import ConfigError, places
 from pinn_dyn.systems.urdf_file import is_mjcf
 
@@ -93,9 +95,9 @@ def may_build(target: Any, trust: tuple[str, ...]) -> bool:
     """Return whether a configuration from a run folder may name a class."""
     package, _, name = str(target).rpartition(".")
     if package.removeprefix("pinn_dyn.") in _PACKAGES and package.startswith("pinn_dyn."):
-        module = importlib.import_module(package)
-        value = getattr(module, name, None) if name in module.__all__ else None
-        if isinstance(value, type) and value.__module__.startswith("pinn_dyn."):
+        # From the source, since some of the classes import Lightning.
+        module, node = definition(target) if name in import_module(package).__all__ else ("", None)
+        if isinstance(node, ast.ClassDef) and module.startswith("pinn_dyn."):
             return True
     return str(target) in _ALLOWED or is_trusted(target, trust)
 

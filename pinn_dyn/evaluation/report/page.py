@@ -118,7 +118,7 @@ def slider(figures: Iterable[tuple[int, Figure]], name: str) -> Markup:
     places = None
     for number, figure in figures:
         if places is not None:  # of the same panels; computing them takes longer than drawing
-            figure.set_layout_engine("none")
+            figure.set_layout_engine(None)  # with "none" each figure would be drawn twice
             for ax, place in zip(figure.axes, places, strict=True):
                 ax.set_position(place)
         drawings[number] = drawing(figure, f"{name} {number}", dpi=80)
