@@ -1,17 +1,26 @@
-"""One cache and a few tiny runs for all tests of the entry points."""
+"""One cache and a tiny run of each kind, made once for all tests and workers of a test run."""
 
 import functools
+import os
 from importlib.metadata import entry_points
 
 import pytest
+from filelock import FileLock
 
-from tests.app.entry import NO_FIGURES, train
+from tests.app.entry import NO_FIGURES, RUNS, train
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory):
+    """Folder of this test run, the same for all its workers."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory):
+def cache(shared):
     """All runs share the cached tiny data sets."""
-    folder = tmp_path_factory.mktemp("cache")
+    folder = shared / "cache"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PINN_DYN_CACHE", str(folder))
         yield folder
@@ -27,19 +36,32 @@ def _kept_entry_points():
 
 
 @pytest.fixture(scope="session")
-def hnn_run(tmp_path_factory):
+def run_of(shared):
+    """Return the folder of the run of a kind, which the first that asks for it trains."""
+
+    def trained(kind):
+        folder = shared / "runs" / kind.replace(" ", "_")
+        with FileLock(shared / f"{folder.name}.lock"):
+            if not (folder / "metrics.json").is_file():
+                train(folder, *RUNS[kind], NO_FIGURES)
+        return folder
+
+    return trained
+
+
+@pytest.fixture(scope="session")
+def hnn_run(run_of):
     """A Hamiltonian network, two epochs."""
-    folder = tmp_path_factory.mktemp("runs") / "hnn"
-    return train(folder, "model=hnn", "trainer.steps=4", "trainer.validations=2", NO_FIGURES)
+    return run_of("hnn")
 
 
 @pytest.fixture(scope="session")
-def lnn_run(tmp_path_factory):
+def lnn_run(run_of):
     """A Lagrangian network."""
-    return train(tmp_path_factory.mktemp("runs") / "lnn", "model=lnn", NO_FIGURES)
+    return run_of("lnn")
 
 
 @pytest.fixture(scope="session")
-def mlp_run(tmp_path_factory):
+def mlp_run(run_of):
     """The paper's black box."""
-    return train(tmp_path_factory.mktemp("runs") / "mlp", "model=mlp", NO_FIGURES)
+    return run_of("mlp")

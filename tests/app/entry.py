@@ -54,6 +54,15 @@ TINY_TRAINING = [
 TINY = [*TINY_DATA, STRIDE, *TINY_TRAINING]
 # Drawing takes longer than the training itself.
 NO_FIGURES = "callbacks.figures=null"
+RUNS = {
+    "hnn": ["model=hnn", "trainer.steps=4", "trainer.validations=2"],
+    "lnn": ["model=lnn"],
+    "mlp": ["model=mlp"],
+    "other seed": ["model=lnn", "seed=1"],
+    "oscillators": ["model=oscillators", "data.steps=5", "data.history=0"],
+    "ensemble": ["model=lnn", "ensemble=3"],
+}
+"""Arguments of the runs that all tests share; a test that changes a run takes a copy."""
 
 
 @contextlib.contextmanager

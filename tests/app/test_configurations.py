@@ -11,12 +11,13 @@ from pinn_dyn.systems import TendonArm
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
+    RUNS,
     STRIDE,
     TINY,
     TINY_DATA,
     TINY_TRAINING,
     assert_trained,
-    fails,
+    refused_text,
     run_script,
     train,
 )
@@ -43,11 +44,6 @@ HEADS = {
 VALUES = {
     "model/potential=chain": "model.angles=[0,1,2]",
 }
-
-
-def said(error, capsys):
-    captured = capsys.readouterr()
-    return f"{captured.out}\n{captured.err}\n{error.code}"
 
 
 def of_arm_1(folder):
@@ -139,9 +135,11 @@ def test_taut_tendons_hold_the_set_points_of_their_experiment():
     assert a.abs().max() < 1e-2
 
 
-@pytest.mark.parametrize("model", [x for x in MODELS if x not in ("lnn", "hnn")])
-def test_every_other_model_trains(tmp_path, model):
-    assert_trained(train(tmp_path / "run", f"model={model}", NO_FIGURES))
+# tests/app/test_training.py trains an acceleration network, into the default folder.
+@pytest.mark.parametrize("model", [x for x in MODELS if x not in ("hnn", "acceleration")])
+def test_every_other_model_trains(tmp_path, run_of, model):
+    run = run_of(model) if model in RUNS else train(tmp_path / "run", f"model={model}", NO_FIGURES)
+    assert_trained(run)
 
 
 TOGETHER = [
@@ -190,8 +188,8 @@ def test_a_curriculum_trains(tmp_path):
     ],
 )
 def test_a_loss_that_does_not_fit_ends_with_its_name(tmp_path, capsys, mistake, words):
-    error = fails("train.py", *TINY, *mistake, f"hydra.run.dir={tmp_path / 'run'}")
-    assert words in said(error, capsys)
+    arguments = [*TINY, *mistake, f"hydra.run.dir={tmp_path / 'run'}"]
+    assert words in refused_text(capsys, "train.py", *arguments)
 
 
 HNN_ON_A_LOG = ["experiment=example_log", "model=hnn", "compile=false", *TINY_TRAINING]
@@ -207,8 +205,8 @@ def test_a_hamiltonian_network_on_velocities_trains_on_a_log(tmp_path, monkeypat
 
 def test_a_hamiltonian_network_on_momenta_is_told_how_to_do_without(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    error = fails("train.py", *HNN_ON_A_LOG, f"hydra.run.dir={tmp_path / 'run'}")
-    assert "set model.state=qv" in said(error, capsys)
+    words = [*HNN_ON_A_LOG, f"hydra.run.dir={tmp_path / 'run'}"]
+    assert "set model.state=qv" in refused_text(capsys, "train.py", *words)
 
 
 def test_what_the_tests_compose_faster_is_what_hydra_composes(tmp_path, kept_compositions):

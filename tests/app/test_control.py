@@ -25,7 +25,6 @@ from tests.app.entry import (
     TINY_TRAINING,
     refused_text,
     run_script,
-    train,
 )
 from tests.app.pages import assert_says_how_it_came_about, page_of
 from tests.support.c_code import function_of
@@ -243,9 +242,8 @@ def test_a_black_box_has_no_terms_to_control_by(capsys, mlp_run):
 
 
 @pytest.fixture(scope="module")
-def oscillators_run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "oscillators"
-    return train(folder, "model=oscillators", "data.steps=5", "data.history=0", NO_FIGURES)
+def oscillators_run(run_of):
+    return run_of("oscillators")
 
 
 def test_oscillators_control_beside_pid_and_the_true_terms(tmp_path, oscillators_run, undrawn):

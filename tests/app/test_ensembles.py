@@ -13,14 +13,13 @@ from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.models import LagrangianNetwork
 from pinn_dyn.models.output_limits import free_weights
 from pinn_dyn.run.run_folder import load_run
-from tests.app.entry import NO_FIGURES, SET_POINTS, run_script, train
+from tests.app.entry import SET_POINTS, run_script
 
 
 @pytest.fixture(scope="module")
-def ensemble_run(tmp_path_factory):
+def ensemble_run(run_of):
     """Three members of the seeds 0, 1 and 2."""
-    folder = tmp_path_factory.mktemp("runs") / "ensemble"
-    return train(folder, "model=lnn", "ensemble=3", NO_FIGURES)
+    return run_of("ensemble")
 
 
 def weights(run):

@@ -136,13 +136,6 @@ def test_runs_are_grouped_by_their_configuration_without_the_seed(
     assert "over seeds" in capsys.readouterr().out
 
 
-def test_runs_of_different_data_sets_are_refused(tmp_path, hnn_run, capsys):
-    other = train(tmp_path / "other", "model=mlp", "dataset.seed=1", NO_FIGURES)
-    text = refused(capsys, hnn_run, other)
-    assert "another data set" in text
-    assert str(other) in text
-
-
 def test_patterns_without_runs_are_refused(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     for pattern in (tmp_path / "nowhere" / "*", tmp_path / "empty"):

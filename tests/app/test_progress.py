@@ -52,18 +52,12 @@ def test_a_training_and_its_evaluation_log_their_progress(quick, tmp_path, capsy
     for part in ("training soft_arm_1/lnn seed 0: ", " of 100 steps, loss ", " s left"):
         assert part in text
         assert part in shown
+    losses = EventAccumulator(str(run / "tensorboard")).Reload().Scalars("train/loss")
+    assert [item.step for item in losses] == list(range(1, 100, 2))
+    assert len({item.value for item in losses}) == 50
     caplog.set_level(logging.INFO)
     pinn_dyn.evaluate(pinn_dyn.load(run), horizon=0.1, windows=[])
     assert "evaluation: 0 of 5 models, now " in caplog.text
-
-
-def test_a_log_of_a_short_training_has_fifty_losses(tmp_path):
-    run = train(tmp_path / "run", "trainer.steps=100", NO_FIGURES)
-    log = EventAccumulator(str(run / "tensorboard"))
-    log.Reload()
-    losses = log.Scalars("train/loss")
-    assert [item.step for item in losses] == list(range(1, 100, 2))
-    assert len({item.value for item in losses}) == 50
 
 
 def test_a_program_without_handlers_gets_the_lines_on_stderr(quick, monkeypatch, capsys):

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 import pinn_dyn
+from pinn_dyn.app.config import composed
 from pinn_dyn.data.logs import LogError, LogSource
 from pinn_dyn.run.run_folder import load_run, require_no_links_out
 from pinn_dyn.run.validation import ConfigError
@@ -124,6 +125,7 @@ def test_runs_of_different_data_are_evaluated_separately_or_on_one_data_set(
     other = train(tmp_path / "other", "model=mlp", "dataset.seed=5", NO_FIGURES)
     words = [f"runs=[{lnn_run},{other}]", "horizon=0.1", "windows=[]"]
     message = str(fails("evaluate.py", *words, f"hydra.run.dir={tmp_path / '0'}").code)
+    assert f"{other} has another data set" in message
     assert "evaluate them separately, or all on one data set, dataset=<name>" in message
     for k, run in enumerate((lnn_run, other), 1):
         words[0] = f"runs=[{run}]"
@@ -135,13 +137,14 @@ def test_runs_of_different_data_are_evaluated_separately_or_on_one_data_set(
     assert len(pd.read_csv(tmp_path / "3" / "summary.csv")) >= 2
 
 
-def test_an_ensemble_has_the_interval_that_a_single_network_has_not(tmp_path, lnn_run):
+def test_an_ensemble_has_the_interval_that_a_single_network_has_not(lnn_run, run_of):
     start, t = np.array([0.0, 0, 0.2, 0, 0, 0]), np.arange(20) * 0.002
     u = np.zeros((20, 3))
     with pytest.raises(TypeError, match="train an ensemble") as error:
         pinn_dyn.load(lnn_run).predict_interval(start, u, t)
     option = re.search(r"\((ensemble=\d+)\)", str(error.value))[1]
-    run = pinn_dyn.load(train(tmp_path / "run", "model=lnn", NO_FIGURES, option))
+    assert composed("train", ["model_name=lnn", option])["ensemble"] > 1
+    run = pinn_dyn.load(run_of("ensemble"))
     low, high = run.predict_interval(start, u, t)
     assert (low < high)[1:].any()
     with pytest.raises(TypeError, match="expected predict") as error:

@@ -11,7 +11,7 @@ import yaml
 
 from pinn_dyn.models.output_limits import free_weights
 from pinn_dyn.run.run_folder import load_run
-from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
+from tests.app.entry import NO_FIGURES, TINY, assert_trained, refused_text, run_script, train
 
 PLAIN = (str, int, float, bool, type(None))
 
@@ -91,10 +91,12 @@ def test_weights_that_do_not_fit_are_refused(tmp_path, capsys, hnn_run, override
     assert re.search(expected, " ".join(text.split()))
 
 
-def test_a_seed_gives_the_same_weights_again_and_another_seed_gives_others(tmp_path, lnn_run):
+def test_a_seed_gives_the_same_weights_again_and_another_seed_gives_others(
+    tmp_path, lnn_run, run_of
+):
     again = train(tmp_path / "again", "model=lnn", NO_FIGURES)
-    other = train(tmp_path / "other", "model=lnn", "seed=1", NO_FIGURES)
-    first, again, other = (load(run)["state_dict"] for run in (lnn_run, again, other))
+    runs = lnn_run, again, run_of("other seed")
+    first, again, other = (load(run)["state_dict"] for run in runs)
     assert first.keys() == again.keys() == other.keys()
     assert all(torch.equal(first[key], again[key]) for key in first)
     assert any(not torch.equal(first[key], other[key]) for key in first)
@@ -104,8 +106,7 @@ def test_runs_go_to_a_folder_named_by_data_set_model_and_seed(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     run_script("train.py", *TINY, NO_FIGURES, "model=acceleration", "seed=3")
     (folder,) = (tmp_path / "runs" / "soft_arm_1" / "acceleration-seed3").iterdir()
-    assert (folder / "metrics.json").is_file()
-    assert (folder / "checkpoints" / "best.ckpt").is_file()
+    assert_trained(folder)
 
 
 def test_a_sweep_writes_a_folder_per_combination(tmp_path):

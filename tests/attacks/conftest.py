@@ -5,7 +5,7 @@ import sys
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.app.conftest import cache, lnn_run, mlp_run  # noqa: F401
+from tests.app.conftest import cache, lnn_run, mlp_run, run_of, shared  # noqa: F401
 
 # What hypothesis tries: the same each time, or others for longer.
 settings.register_profile(

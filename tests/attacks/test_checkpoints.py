@@ -8,7 +8,7 @@ import torch
 
 from pinn_dyn.run.run_folder import load_run
 from pinn_dyn.run.validation import ConfigError
-from tests.app.entry import NO_FIGURES, TINY, refused_text, train
+from tests.app.entry import NO_FIGURES, TINY, refused_text
 
 
 def flip_a_bit(path):
@@ -87,8 +87,8 @@ def test_weights_of_another_model_are_refused(run, mlp_run):
         load_run(run)
 
 
-def test_a_run_folder_is_what_its_checkpoint_says(tmp_path, run, capsys):
-    other = train(tmp_path / "other", "model=lnn", "seed=1", NO_FIGURES)
+def test_a_run_folder_is_what_its_checkpoint_says(run_of, run, capsys):
+    other = run_of("other seed")
     for name in ("best", "last"):
         shutil.copy(other / "checkpoints" / f"{name}.ckpt", run / "checkpoints")
     (run / "metrics.json").write_text("damaged")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
 from pinn_dyn.models import (
     ConstantCholesky,
@@ -16,17 +17,9 @@ from pinn_dyn.models import (
     Positive,
     Statistics,
 )
-from pinn_dyn.models.output_limits import (
-    output_limits,
-    set_output_limits,
-)
-from tests.models.builders import (
-    CHAIN,
-    make_statistics,
-    make_structured,
-)
+from pinn_dyn.models.output_limits import output_limits, set_output_limits
+from tests.models.builders import CHAIN, make_statistics, make_structured
 from tests.support.contracts import slow_except
-from tests.support.outside_the_data import OutsideTheDataContract
 
 N = 2
 MASSES = {
@@ -63,7 +56,84 @@ def along_a_line(data, count=200):
     return data.q_low + place * (data.q_high - data.q_low)
 
 
-class MechanicalNetwork(OutsideTheDataContract):
+class OutsideTheData:
+    """What a network ``system`` must satisfy at states up to ``times`` the range of its data.
+
+    ``ranges`` are the smallest and largest (q, v) or (q, p) in the data, ``(2, 2N)``, and ``seen``
+    are the configurations, ``(K, N)``, that the network has its limits from.
+    """
+
+    times = 5.0
+    smallest, largest = 0.05, 4.0
+    """Eigenvalues of M anywhere, in units of the smallest and the largest on the data."""
+    duration, tolerance = 20.0, 1e-5
+    """Duration of a rollout without input, s, and relative tolerance of its integrator."""
+
+    @pytest.fixture(autouse=True)
+    def _values_only(self):
+        with torch.no_grad():
+            yield
+
+    def states(self, ranges, times, count, seed=0):
+        """Uniform over ``times`` the range of the data."""
+        generator = torch.Generator().manual_seed(seed)
+        low, high = ranges
+        place = 2 * torch.rand(count, len(low), generator=generator, dtype=torch.float64) - 1
+        return (low + high) / 2 + times * place * (high - low) / 2
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_a_thousand_far_states_have_finite_accelerations(self, system, ranges, dtype):
+        q, v = self.states(ranges, self.times, 1000).to(dtype).chunk(2, -1)
+        model = system.to(dtype)
+        u = torch.ones(1000, model.num_inputs, dtype=dtype)
+        assert torch.isfinite(model.forward_dynamics(q, v, u)).all()
+        assert torch.isfinite(model.state_derivative(torch.cat([q, v], -1), u)).all()
+
+    def test_the_mass_is_nowhere_much_smaller_or_larger_than_on_the_data(
+        self, system, ranges, seen
+    ):
+        """Over all q: the corners of the box that no motion has been in, its edges and far out."""
+        n = system.num_coordinates
+        shown = torch.linalg.eigvalsh(system.mass_matrix(seen))
+        for times in (1.0, 1.2, 2.0, self.times, 100.0):
+            q = self.states(ranges, times, 4000)[:, :n]
+            found = torch.linalg.eigvalsh(system.mass_matrix(q))
+            assert float(found.min()) > self.smallest * float(shown.min()), times
+            assert float(found.max()) < self.largest * float(shown.max()), times
+
+    def test_without_input_energy_is_only_lost(self, system, ranges):
+        """Along rollouts from far outside, by an adaptive integrator: E never grows."""
+        n, count = system.num_coordinates, 1
+        x0 = self.states(ranges, self.times, count, seed=1)
+        u = torch.zeros(count, system.num_inputs, dtype=torch.float64)
+
+        def derivative(t, flat):
+            x = torch.from_numpy(flat).reshape(count, 2 * n)
+            return system.state_derivative(x, u).reshape(-1).numpy()
+
+        solution = solve_ivp(
+            derivative,
+            (0, self.duration),
+            x0.reshape(-1).numpy(),
+            method="LSODA",
+            rtol=self.tolerance,
+            atol=1e-3 * self.tolerance,
+        )
+        assert solution.success, solution.message
+        x = torch.from_numpy(solution.y.T.copy()).reshape(-1, count, 2 * n)
+        q, v = x.chunk(2, -1)
+        if system.state == "qp":
+            v = system.velocity(q, v)
+        energy = system.total_energy(q, v)
+        assert torch.isfinite(energy).all()
+        spent = energy[0] - energy.amin(0)
+        assert (spent > 0).all()
+        # The integrator's error grows with the number of steps.
+        gained = (energy - energy.cummin(0).values).amax(0)
+        assert (gained < 1e2 * self.tolerance * spent).all(), (gained / spent).tolist()
+
+
+class MechanicalNetwork(OutsideTheData):
     """The ranges of the builders' data."""
 
     size = N
@@ -104,7 +174,7 @@ class TestASerialChain(MechanicalNetwork):
         return limited(make_structured(kind, **CHAIN[kind] | {"m": 1}), seen)
 
 
-class TestATrainedNetwork(OutsideTheDataContract):
+class TestATrainedNetwork(OutsideTheData):
     """Of the one-segment arm over the paper's range: 2,500 steps, heads of 24 units.
 
     Its checkpoint as the training left it, with scales, 500 of the training configurations and the
