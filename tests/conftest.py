@@ -69,7 +69,7 @@ def few_states(monkeypatch):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """No pictures and no pages of the programs: they take longer than all else."""
+    """No pictures, pages and linear models as baselines: they take longer than all else."""
     monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
     monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
     monkeypatch.setattr("pinn_dyn.log_check.check.LogCheck.save", lambda *_: "nowhere")
@@ -77,3 +77,8 @@ def undrawn(monkeypatch):
     monkeypatch.setattr(f"{evaluation}.Evaluation.figures", lambda *_: iter(()))
     page = f"{evaluation}.report.prediction_page.prediction_report"
     monkeypatch.setattr(page, lambda *_: "")
+
+    def left_out(*_, **__):
+        raise ValueError("left out")
+
+    monkeypatch.setattr(f"{evaluation}.baselines.fit_linear_rival", left_out)

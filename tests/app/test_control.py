@@ -203,8 +203,9 @@ def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
 ):
     written = []
     monkeypatch.setattr("pinn_dyn.control.export.write", lambda *given: written.append(given))
-    words = ["rate=200", "~controllers.pd", "~controllers.truth", "duration=0.1", "settled_after=0"]
-    words += ["controllers=tracking", "exported_law=learned_observer", "export_real=float"]
+    words = ["rate=200", "~controllers.pd", "~controllers.truth", "duration=0.01"]
+    words += ["settled_after=0", "controllers=tracking", "exported_law=learned_observer"]
+    words += ["export_real=float"]
     control(tmp_path / "c", lnn_run, f"export={tmp_path}/law.c", *words)
     (((law,), path, info, real),) = written
     assert (law.name, path.name, real) == ("control", "law.c", "float")

@@ -102,6 +102,7 @@ def test_a_controller_takes_one_member(tmp_path, monkeypatch, ensemble_run):
     def errors(run, *arguments):
         folder = tmp_path / f"{run.name}-{len(arguments)}"
         words = [f"run={run}", f"hydra.run.dir={folder}", *SET_POINTS, "rate=200"]
+        words += ["~controllers.truth"]
         run_script("control.py", *words, *arguments)
         return pd.read_csv(folder / "summary.csv")["rms_error"].tolist()
 

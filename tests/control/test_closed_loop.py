@@ -137,6 +137,3 @@ def test_the_plant_gets_the_limited_input():
     x = torch.cat([record.q, record.v, u], -1)
     expected = x[:, :-1] @ torch.from_numpy(step.T)
     torch.testing.assert_close(x[:, 1:, :4], expected[..., :4], rtol=0, atol=1e-6)
-
-
-# Bad arguments.

@@ -22,8 +22,6 @@ from tests.support.cart_pole import CartPole
 from tests.support.contracts import one_case
 from tests.support.linear import double
 
-MODEL_BASED = [ProportionalDerivative, Regulation, Tracking, ComputedTorque]
-
 
 def linear_system(n, m, seed=0):
     """Random M, D > 0, K and a random N x M input matrix, all full."""

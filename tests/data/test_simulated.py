@@ -294,6 +294,3 @@ def test_constants_in_tensors_are_part_of_the_entry(tmp_path):
 
     assert describe(1.0) == describe(1.0)
     assert describe(1.0) != describe(2.0)
-
-
-# Bad arguments.

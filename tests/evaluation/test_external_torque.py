@@ -157,7 +157,7 @@ def test_a_held_input_acts_until_the_next_sample():
     assert observed_torques(chain, line, BANDWIDTH)[0].abs().max() > 0.1
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", ["double", pytest.param("float", marks=pytest.mark.slow)])
 def test_the_c_function_gives_the_torques_of_the_log(run, tmp_path, real):
     path = run.export(tmp_path / "contact.c", "external_torque", real=real)
     call = function_of(path, "contact_external_torque")

@@ -282,6 +282,12 @@ def test_another_payload_is_named():
     assert "run run2 does not fit" in read(frames)[RESIDUAL][0]
 
 
+@pytest.mark.parametrize(("reversed_runs", "named"), [([1, 4], ["run1", "run4"]), ([0, 1, 4], [])])
+def test_at_most_a_third_of_the_runs_is_bad(reversed_runs, named):
+    texts = read(edited(times(-1, *FORCES), reversed_runs)).get(RESIDUAL, [])
+    assert [text.split()[1] for text in texts] == named
+
+
 def test_v_reversed_after_the_first_half_of_each_run():
     (text,) = read(edited(from_the_middle(np.negative, "v2")))[SLOPE]
     assert "(4 to 8 s) and 5 more runs, columns 'q2' and 'v2': the derivative of q is -1" in text

@@ -26,6 +26,13 @@ def prediction():
     return text, Page(text), item
 
 
+@pytest.fixture
+def empty_pictures(monkeypatch):
+    """Pages with empty pictures of the trajectories, which take longer than all else."""
+    page = "pinn_dyn.evaluation.report.prediction_page"
+    monkeypatch.setattr(f"{page}.trajectory_figure", lambda *_, **__: Figure())
+
+
 @pytest.fixture(scope="module")
 def control():
     text, summary = control_page()
@@ -67,7 +74,7 @@ def test_control_laws_are_listed_with_the_reason_of_a_stop(control):
     assert stop == {"law": "pd", "run": "2", "reason": "1.20 s: A is singular"}
 
 
-def test_odd_names_stay_text():
+def test_odd_names_stay_text(empty_pictures):
     pages = [
         prediction_page(names=(ODD, "lnn"))[0],
         control_page(names=(ODD, "lnn"), title=ODD)[0],
@@ -79,7 +86,7 @@ def test_odd_names_stay_text():
         assert "<img src=x" not in text
 
 
-def test_sections_of_constants_torques_and_parts_appear_with_their_data(prediction):
+def test_sections_of_constants_torques_and_parts_appear_with_their_data(prediction, empty_pictures):
     rows = [
         ["mass of link", 91.0548, 79.3, 102.8, "kg", 50.0, 0.999],
         ["armature of screw", 4.0, 0.0, 15.7, "kg", 4.0, 0.0004],
@@ -146,7 +153,7 @@ def test_a_slider_of_large_figures_stays_small():
     assert text.count("<img") < 20
 
 
-def test_a_saved_evaluation_has_tables_figures_and_a_page(tmp_path):
+def test_a_saved_evaluation_has_tables_figures_and_a_page(tmp_path, empty_pictures):
     item = evaluation()
     item.save(tmp_path / "out")
     summary = pd.read_csv(tmp_path / "out" / "summary.csv")

@@ -144,11 +144,23 @@ def test_the_compiler_sees_wrong_sizes_and_the_caller_the_version(tmp_path):
     assert (len(info["sha256"]), info["model"]) == (64, "AccelerationMLP")
 
 
-def test_powers_are_powers_and_constants_of_floats_are_floats(tmp_path):
+def powers_of(x):
+    return 0.1 * torch.cat([x**3, x**2, x.abs() ** 0.5, x.exp() ** -1.5])
+
+
+WEIGHTS = torch.rand(4, 20, generator=torch.Generator().manual_seed(0)).double()
+
+
+@pytest.mark.parametrize(
+    "function",
+    [powers_of, lambda x: (WEIGHTS.to(x) @ powers_of(x.expand(5))[:, None])[:, 0]],
+    ids=["numbers", "loops"],
+)
+def test_powers_are_powers_and_constants_of_floats_are_floats(tmp_path, function):
     """A constant without f would make the compiler compute with doubles."""
-    function = lambda x: 0.1 * torch.cat([x**3, x**2, x.abs() ** 0.5, x.exp() ** -1.5])  # noqa: E731
     powers = ExportedFunction("powers", function, SINE.inputs, "y")
     write([powers], tmp_path / "f.c", {})
+    assert ("for (int" in (tmp_path / "f.c").read_text()) == (function is not powers_of)
     path = write([powers], tmp_path / "f.c", {}, "float")
     command = ["cc", *STRICT, "-Wdouble-promotion", "-c", path.name, "-o", "f.o"]
     subprocess.run(command, cwd=tmp_path, check=True)

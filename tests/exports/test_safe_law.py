@@ -1,5 +1,7 @@
 """Laws with limits, guard and observer: the C file against the loop in Python."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -21,12 +23,13 @@ from pinn_dyn.mechanics import InputSolver
 from pinn_dyn.systems import TendonArm
 from tests.models.builders import VARIANTS, make_structured
 from tests.support.c_code import function_of
+from tests.support.contracts import slow_except
 
 pytestmark = pytest.mark.usefixtures("few_states")
 
 PERIOD = 0.01
 LIMITS = dict(low=[-20.0, -9.0, -3.0], high=15.0, rate=400.0)
-REST = [np.zeros(3)] * 3
+FALL_BACKS = [None, "hold", "regulation"]
 
 
 @pytest.fixture(scope="module")
@@ -42,24 +45,48 @@ def motion(steps):
     return [f(t + k) for k, f in enumerate((torch.sin, torch.cos, torch.sin, torch.cos, torch.sin))]
 
 
-def control_of(path, law, **options):
-    """The law of the file with its memory, as a loop calls it."""
-    call = function_of(export_law(law, path, period=PERIOD, **options), f"{path.stem}_control")
-    memory = [np.zeros(1 + 4 * 3)]
+def in_file(law, path, **options):
+    """The function of the file of a law."""
+    return function_of(export_law(law, path, period=PERIOD, **options), "law_control")
+
+
+def with_memory(call, size=3):
+    """The law of a file with its memory, as a loop calls it."""
+    memory = [np.zeros(size)]
 
     def control(*state):
-        size = 13 if isinstance(law, DisturbanceObserver) else 3
-        u, memory[0], status = call(*state, memory[0][:size])
+        u, memory[0], status = call(*state, memory[0])
         return u, status
 
     return control
 
 
-def test_an_observer_with_limits_gives_the_inputs_of_the_loop(law, tmp_path):
-    options = dict(bandwidth=20.0, max_rate=50.0)
-    observer = DisturbanceObserver(law, **options, actuator=Actuator(**LIMITS))
-    actuator = Actuator(**LIMITS)
-    control = control_of(tmp_path / "law.c", observer, actuator=actuator)
+@pytest.fixture(scope="module")
+def limited(law, tmp_path_factory):
+    """An observer with limits, and the function of its file."""
+    options = dict(bandwidth=20.0, max_rate=50.0, actuator=Actuator(**LIMITS))
+    observer = DisturbanceObserver(law, **options)
+    path = tmp_path_factory.mktemp("limited") / "law.c"
+    return observer, in_file(observer, path, actuator=Actuator(**LIMITS))
+
+
+@pytest.fixture(scope="module")
+def guarded_observer(law, tmp_path_factory):
+    """Return a guard over an observer, and the function of its file."""
+    x = motion(100)
+    region = DataRegion(x[0].split(50), x[1].split(50), samples=77)
+
+    @functools.cache
+    def exported(fallback):
+        guarded = Guarded(DisturbanceObserver(law, 20.0), region, threshold=1.5, fallback=fallback)
+        return guarded, in_file(guarded, tmp_path_factory.mktemp("guarded") / "law.c")
+
+    return exported
+
+
+def test_an_observer_with_limits_gives_the_inputs_of_the_loop(limited):
+    observer, call = limited
+    actuator, control = Actuator(**LIMITS), with_memory(call, 13)
     statuses = set()
     for k, state in enumerate(zip(*motion(50), strict=True)):
         u = observer(k * PERIOD, *state[:2], Motion(*state[2:]))
@@ -72,13 +99,13 @@ def test_an_observer_with_limits_gives_the_inputs_of_the_loop(law, tmp_path):
     assert observer.residual.abs().min() > 0.01
 
 
-@pytest.mark.parametrize("fallback", [None, "hold", "regulation"])
+@pytest.mark.parametrize("fallback", slow_except(FALL_BACKS, [None, "regulation"]))
 def test_a_guard_falls_back_in_the_file_as_in_the_loop(law, tmp_path, fallback):
     data = motion(100)
     parts = [x.split(50) for x in data[:2]]
     region = DataRegion(*parts, angles=[1], samples=77)
     guarded = Guarded(law, region, threshold=1.5, fallback=fallback)
-    control = control_of(tmp_path / "law.c", guarded)
+    control = with_memory(in_file(guarded, tmp_path / "law.c"))
     outside = []
     for k, state in enumerate(zip(*motion(20), strict=True)):
         far = (k % 5 == 4) * torch.tensor([0.0, 2 * torch.pi, 6.0 if k == 9 else 0.0])
@@ -119,9 +146,8 @@ def test_gains_of_another_unit_do_not_fall_back(law):
     assert "hold" in FallBack.__args__
 
 
-def test_numbers_that_are_not_finite_give_the_last_input(law, tmp_path):
-    observer = DisturbanceObserver(law, 20.0)
-    control = control_of(tmp_path / "law.c", observer, actuator=Actuator(**LIMITS))
+def test_numbers_that_are_not_finite_give_the_last_input(limited):
+    control = with_memory(limited[1], 13)
     good = [x[1].numpy() for x in motion(2)]
     last, _ = control(*good)
     for bad in (np.nan, np.inf):
@@ -136,7 +162,10 @@ def test_numbers_that_are_not_finite_give_the_last_input(law, tmp_path):
     assert not status & 4
 
 
-@pytest.mark.parametrize("bad", [[-np.inf, 0, 0], [np.inf, -np.inf, 0], [0, np.nan, 0]])
+NOT_FINITE = [[-np.inf, 0, 0], [np.inf, -np.inf, 0], [0, np.nan, 0]]
+
+
+@pytest.mark.parametrize("bad", NOT_FINITE)
 def test_an_input_that_is_not_finite_gives_the_last_whatever_its_sum(law, monkeypatch, bad):
     """The sum of minus infinity is less than every number."""
     safe = SafeLaw(law)
@@ -148,12 +177,22 @@ def test_an_input_that_is_not_finite_gives_the_last_whatever_its_sum(law, monkey
     assert torch.equal(memory, last)
 
 
-def test_a_held_input_does_not_spoil_the_memory_of_the_observer(law, tmp_path):
+@pytest.mark.parametrize("bad", NOT_FINITE)
+def test_an_observer_keeps_its_memory_whatever_the_sum_of_the_next(law, monkeypatch, bad):
+    observer = DisturbanceObserver(law, 20.0)
+    safe = SafeLaw(observer, period=PERIOD)
+    u, before = torch.tensor([1.0, 2.0, 3.0]).double(), torch.linspace(1, 2, safe.memory_size)
+    after = torch.zeros(observer.memory_size).double()
+    after[:3] = torch.tensor(bad)
+    monkeypatch.setattr(observer, "correct", lambda *_: (u, lambda applied: after))
+    _, status, memory = safe(*[torch.zeros(3).double()] * 5, before.double())
+    assert status == 0
+    assert torch.equal(memory, torch.cat([u, before.double()[3:]]))
+
+
+def test_a_held_input_does_not_spoil_the_memory_of_the_observer(guarded_observer):
     """An infinite velocity is outside the data, so the guard holds a finite input."""
-    x = motion(100)
-    region = DataRegion(x[0].split(50), x[1].split(50))
-    guarded = Guarded(DisturbanceObserver(law, 20.0), region, threshold=1.5, fallback="hold")
-    call = function_of(export_law(guarded, tmp_path / "law.c", period=PERIOD), "law_control")
+    _, call = guarded_observer("hold")
     good = [part[1].numpy() for part in motion(2)]
     _, before, _ = call(*good, np.zeros(13))
     _, after, status = call(good[0], np.full(3, np.inf), *good[2:], before)
@@ -162,13 +201,10 @@ def test_a_held_input_does_not_spoil_the_memory_of_the_observer(law, tmp_path):
     assert np.isfinite(call(*good, after)[1]).all()
 
 
-@pytest.mark.parametrize("fallback", [None, "hold", "regulation"])
-def test_a_guard_over_an_observer_acts_in_the_loop_as_in_the_file(law, tmp_path, fallback):
+@pytest.mark.parametrize("fallback", slow_except(FALL_BACKS, ["hold"]))
+def test_a_guard_over_an_observer_acts_in_the_loop_as_in_the_file(guarded_observer, fallback):
     """The observer of the loop counts the input of the guard."""
-    x = motion(100)
-    region = DataRegion(x[0].split(50), x[1].split(50), samples=77)
-    guarded = Guarded(DisturbanceObserver(law, 20.0), region, threshold=1.5, fallback=fallback)
-    call = function_of(export_law(guarded, tmp_path / "law.c", period=PERIOD), "law_control")
+    guarded, call = guarded_observer(fallback)
     memory = np.zeros(13)
     for k, state in enumerate(zip(*motion(12), strict=True)):
         q = state[0] + 6.0 * (k in (5, 6))
@@ -179,7 +215,7 @@ def test_a_guard_over_an_observer_acts_in_the_loop_as_in_the_file(law, tmp_path,
 
 
 def test_the_first_input_is_limited_from_zero(law, tmp_path):
-    control = control_of(tmp_path / "law.c", law, actuator=Actuator(rate=10.0))
+    control = with_memory(in_file(law, tmp_path / "law.c", actuator=Actuator(rate=10.0)))
     u, status = control(*[10 * np.ones(3), *[np.zeros(3)] * 4])
     np.testing.assert_allclose(np.abs(u), 0.1)
     assert status == 1

@@ -79,13 +79,32 @@ def test_rollouts_fit_friction_that_sticks():
     assert float(ratio.log().abs().max()) < 0.05  # 0.6 with the smooth law
 
 
-@pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "rollouts"])
-def test_the_dynamics_are_found_from_a_generic_start(truth, runs, unseen, rollouts):
+@pytest.fixture(scope="module")
+def identified(runs):
+    """A model that was fitted by inverse dynamics alone, and its fit."""
+    model = robot_model("generic")
+    return model, LeastSquares(cutoff=20.0, rollouts=False).fit(model, runs)
+
+
+@pytest.fixture(scope="module")
+def rolled_out(truth, runs, unseen):
+    """A model whose rollouts validate better, and its fit."""
     windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
     model = robot_model("generic")
-    before = held_out_error(model, truth, unseen)
-    result = LeastSquares(cutoff=20.0, rollouts=rollouts).fit(model, runs, windows)
-    assert before > 0.3
+    fit = LeastSquares(cutoff=20.0).fit(
+        model,
+        runs,
+        windows,
+        validate=lambda model: torch.tensor([held_out_error(model, truth, unseen)]),
+    )
+    return model, fit
+
+
+@pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "rollouts"])
+def test_the_dynamics_are_found_from_a_generic_start(request, truth, unseen, rollouts):
+    model, result = request.getfixturevalue("rolled_out" if rollouts else "identified")
+    assert result.stage == ("rollouts of 0.04 s" if rollouts else "inverse dynamics")
+    assert held_out_error(robot_model("generic"), truth, unseen) > 0.3
     assert held_out_error(model, truth, unseen) < (0.01 if rollouts else 0.05)
     assert result.residual < (0.001 if rollouts else 0.05)
     # The base parameters of a planar chain are fewer than ten for each body: the rest is held by
@@ -96,11 +115,9 @@ def test_the_dynamics_are_found_from_a_generic_start(truth, runs, unseen, rollou
 
 
 @pytest.mark.slow
-def test_a_payload_is_found_from_seconds_where_all_else_is_known(truth, runs):
+def test_a_payload_is_found_from_seconds_where_all_else_is_known(truth, runs, identified):
     windows = draw_windows(runs, count=4, steps=1, stride=1, seed=0)
-    solver = LeastSquares(cutoff=20.0, rollouts=False)
-    before = robot_model("generic")
-    known = solver.fit(before, runs, windows)
+    before, known = identified
     loaded = copy.deepcopy(truth)
     with torch.no_grad():
         loaded.bodies.z[1] += torch.tensor([0.3, 0.2, 0.1, 0.1, 0.0, 0.2, 0.0, 0.3, 0.0, 0.2])
@@ -108,7 +125,7 @@ def test_a_payload_is_found_from_seconds_where_all_else_is_known(truth, runs):
     adapted, anew = copy.deepcopy(before), robot_model("generic")
     changed = LeastSquares(cutoff=20.0, rollouts=False, changed=["tip"])
     found = changed.fit(adapted, short, windows, known.covariance)
-    solver.fit(anew, short, windows)
+    LeastSquares(cutoff=20.0, rollouts=False).fit(anew, short, windows)
     other = motion(loaded, seconds=1.0, rate=100.0, seed=9)
     errors = [held_out_error(model, loaded, other) for model in (before, adapted, anew)]
     assert errors[1] < 0.3 * min(errors[0], errors[2])
@@ -288,7 +305,7 @@ def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
 @pytest.mark.parametrize(
     "at", [pytest.param(0, marks=pytest.mark.slow), 3], ids=["at once", "interrupted"]
 )
-def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
+def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, identified, at):
     """Windows that start at wrong velocities spoil the rollouts, not the identification."""
     windows = draw_windows(runs, count=20, steps=4, stride=1, seed=0)
     noise = torch.randn(windows.v.shape, generator=torch.Generator().manual_seed(0)).double()
@@ -301,8 +318,8 @@ def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
             raise KeyboardInterrupt
         return torch.tensor([errors[-1]])
 
-    model, alone, solver = robot_model("generic"), robot_model("generic"), LeastSquares(cutoff=20.0)
-    expected = LeastSquares(cutoff=20.0, rollouts=False).fit(alone, runs)
+    model, solver = robot_model("generic"), LeastSquares(cutoff=20.0)
+    alone, expected = identified
     if at:
         with pytest.raises(KeyboardInterrupt):
             solver.fit(model, runs, windows, validate=validate, keep=kept.append)
@@ -342,19 +359,6 @@ def test_a_later_stage_is_kept_unless_it_is_clearly_worse(runs, monkeypatch, cha
     model = robot_model("prior")
     LeastSquares(cutoff=20.0).fit(model, runs, windows, validate=lambda _: next(errors))
     assert float(next(model.parameters()).detach().flatten()[0]) == stage
-
-
-def test_rollouts_that_validate_better_are_kept(truth, runs, unseen):
-    windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
-    model = robot_model("generic")
-    result = LeastSquares(cutoff=20.0).fit(
-        model,
-        runs,
-        windows,
-        validate=lambda model: torch.tensor([held_out_error(model, truth, unseen)]),
-    )
-    assert result.stage == "rollouts of 0.04 s"
-    assert held_out_error(model, truth, unseen) < 0.01
 
 
 def test_a_long_stage_logs_its_progress(runs, caplog, monkeypatch):
