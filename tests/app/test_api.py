@@ -337,6 +337,7 @@ def test_a_training_leaves_the_random_numbers_and_the_threads_alone():
     assert run.predict([0.0, 0.0], np.ones((3, 1)), [0, 0.01, 0.02]).shape == (3, 2)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_source_made_in_python_can_be_evaluated_from_its_folder(tmp_path):
     run = tmp_path / "run"
     pinn_dyn.train(Still(), "lnn", folder=run, **SHORT)

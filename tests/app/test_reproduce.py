@@ -96,6 +96,7 @@ def test_the_comparison_has_new_and_recorded_errors(calls, tmp_path, monkeypatch
     assert table.loc[("arm/lnn", "lnn")].tolist() == [0.2, 0.3]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_real_programs_write_what_reproduce_looks_for(tmp_path, monkeypatch):
     def run(command, check):
         run_script(Path(command[1]).name, *command[2:])

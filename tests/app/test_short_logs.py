@@ -35,10 +35,9 @@ def short_log(seconds, rate):
     return pd.DataFrame(rows, columns=["t", "q", "v", "tau"])
 
 
-@pytest.mark.parametrize(("seconds", "rate"), [(2, 50)])
-def test_seconds_of_a_log_give_the_constants(tmp_path, seconds, rate):
+def test_seconds_of_a_log_give_the_constants(tmp_path):
     run = pinn_dyn.fit(
-        short_log(seconds, rate),
+        short_log(2, 50),
         q="q",
         v="v",
         u="tau",
