@@ -158,7 +158,7 @@ def test_a_held_input_acts_until_the_next_sample():
 
 
 @pytest.mark.parametrize("real", ["double", pytest.param("float", marks=pytest.mark.slow)])
-def test_the_c_function_gives_the_torques_of_the_log(run, tmp_path, real):
+def test_the_c_function_gives_the_torques_of_the_log(run, tmp_path, few_states, real):
     path = run.export(tmp_path / "contact.c", "external_torque", real=real)
     call = function_of(path, "contact_external_torque")
     frame = log(1, 2.0, contact=0.5)

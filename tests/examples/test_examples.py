@@ -89,7 +89,7 @@ def test_the_example_log_determines_a_model_that_controls(home):
 
 
 @pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
-def test_export_and_call(own_log):
+def test_export_and_call(own_log, few_states):
     assert "the same as before the export: True" in run("export_and_call.py", RUN)
 
 
@@ -120,7 +120,7 @@ def test_identified_robot():
 
 
 @pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
-def test_contact(home):
+def test_contact(home, few_states):
     """The push of 6, -9 and 8 N from 4.0 s on is the only contact."""
     text = run("contact.py")
     (contact,) = re.findall(r"the frame +(\S+) +(\S+) +q", text)
