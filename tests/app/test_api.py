@@ -24,7 +24,6 @@ from pinn_dyn.data.logs import InputDelay, MovingAverage
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import AccelerationMLP, LagrangianNetwork
 from pinn_dyn.run.training import STEPS
-from pinn_dyn.run.training import _windows as default_windows
 from tests.app.entry import ROOT, TINY_DATA, run_script
 
 Q = {"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]}
@@ -218,7 +217,7 @@ def test_a_black_box_has_no_terms(black_box):
 # Training.
 
 
-def test_train_has_the_defaults_of_the_command_line():
+def test_train_has_the_defaults_of_the_command_line(monkeypatch):
     built = training_arguments(composed("train", ["model_name=hnn"]), ROOT)
     defaults = {
         name: parameter.default
@@ -228,8 +227,16 @@ def test_train_has_the_defaults_of_the_command_line():
         assert built[name] == defaults[name]
     assert built["steps"] == STEPS
     assert built["validations"] == 4
-    defaults["data"] = default_windows(Still(), "hnn", defaults["optimizer"])
     assert built["trainer"] == defaults["trainer"]
+    used = {}
+
+    def stop(source, model, name, parts):
+        used.update(parts)
+        raise InterruptedError
+
+    monkeypatch.setattr("pinn_dyn.run.training._description", stop)
+    with pytest.raises(InterruptedError):
+        pinn_dyn.train(Still(), "hnn")
 
     def arguments(builder):
         function = getattr(builder, "func", builder)
@@ -238,7 +245,7 @@ def test_train_has_the_defaults_of_the_command_line():
         return function, given | getattr(builder, "keywords", {})
 
     for name in ("loss", "optimizer", "scheduler", "data", "validator"):
-        assert arguments(built[name]) == arguments(defaults[name]), name
+        assert arguments(built[name]) == arguments(used[name]), name
 
 
 @pytest.mark.parametrize("name", ["lnn", "hnn", "acceleration", "mlp"])

@@ -78,7 +78,7 @@ def test_an_entry_of_nested_messages(tmp_path):
     assert frame.loc[1].tolist() == [pytest.approx(3.000000005), 1.5, 12.5, 7]
 
 
-def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
+def test_of_another_clock_inputs_are_the_last_and_velocities_are_interpolated(tmp_path):
     formats.write_bag(tmp_path / "run", TABLE, late=0.004)
     log = source(tmp_path, files="run", **formats.BAG)
     first = log.load().train[0]
@@ -86,33 +86,25 @@ def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
     np.testing.assert_allclose(first.u[:50], TABLE[["u1", "u2"]].to_numpy()[:50], atol=1e-9)
     np.testing.assert_allclose(first.q[:50], TABLE[["q1", "q2"]].to_numpy()[1:51], atol=1e-9)
     assert "1 of 601 rows lack a value and are dropped" in log.report
-
-
-@pytest.mark.parametrize("clock", ["t", "header/stamp"])
-def test_the_last_of_several_commands_at_a_time_counts(tmp_path, clock):
-    formats.write_bag(tmp_path / "run", TABLE, twice=True)
-    time = dict(columns=f"/joint_states/{clock}", unit="s")
-    log = source(tmp_path, files="run", **formats.BAG | {"time": time})
-    assert_read(log, TABLE)
-    assert not log.warnings
-
-
-def test_a_bag_at_a_rate_has_the_rows_of_q(tmp_path):
-    formats.write_bag(tmp_path / "run", TABLE, twice=True)
-    log = source(tmp_path, files="run", **formats.BAG | {"time": {"rate": 100}})
-    run = log.cleaned[0].raw
-    np.testing.assert_allclose(run.q, TABLE[["q1", "q2"]][: len(run)])
-    np.testing.assert_allclose(run.u, TABLE[["u1", "u2"]][: len(run)], atol=1e-9)
-
-
-def test_velocities_of_another_topic_are_interpolated(tmp_path):
-    formats.write_bag(tmp_path / "run", TABLE, late=0.004)
     u = dict(columns=formats.BAG["q"]["columns"], unit="Nm")
     q = dict(columns=formats.BAG["u"]["columns"], unit="rad")
     description = formats.BAG | {"time": dict(columns="/commands/t", unit="s"), "q": q, "u": u}
     run = source(tmp_path, files="run", **description).cleaned[0].raw
     np.testing.assert_allclose(run.q, TABLE[["u1", "u2"]].to_numpy()[: len(run)], atol=1e-9)
     np.testing.assert_allclose(run.v[:, 0], np.interp(run.t, TABLE["t"], TABLE["v1"]), atol=1e-9)
+
+
+def test_the_last_of_several_commands_at_a_time_counts_and_rows_are_those_of_q(tmp_path):
+    formats.write_bag(tmp_path / "run", TABLE, twice=True)
+    for clock in ("t", "header/stamp"):
+        time = dict(columns=f"/joint_states/{clock}", unit="s")
+        log = source(tmp_path, files="run", **formats.BAG | {"time": time})
+        assert_read(log, TABLE)
+        assert not log.warnings
+    log = source(tmp_path, files="run", **formats.BAG | {"time": {"rate": 100}})
+    run = log.cleaned[0].raw
+    np.testing.assert_allclose(run.q, TABLE[["q1", "q2"]][: len(run)])
+    np.testing.assert_allclose(run.u, TABLE[["u1", "u2"]][: len(run)], atol=1e-9)
 
 
 def test_stamps_since_1970_are_shown_in_seconds_of_the_run(tmp_path):
@@ -145,16 +137,12 @@ def test_python_objects_in_npz_are_refused(tmp_path):
         source(tmp_path, files="objects.npz", **formats.VECTORS).load()
 
 
-def test_lerobot_files_have_episodes_and_vectors(tmp_path):
+def test_lerobot_files_have_vectors_and_episodes_also_without_their_column(tmp_path):
     formats.write_lerobot(tmp_path, TABLE)
     parts = source(tmp_path, **formats.LEROBOT).cleaned
     assert len({part.raw.run for part in parts}) == 3
     np.testing.assert_allclose(parts[0].raw.q[:, 0], TABLE["q1"][: len(parts[0].raw)])
     np.testing.assert_allclose(parts[0].raw.u[:, 1], TABLE["u2"][: len(parts[0].raw)])
-
-
-def test_episodes_are_told_apart_by_the_restart_of_the_clock(tmp_path):
-    formats.write_lerobot(tmp_path, TABLE)
     log = source(tmp_path, **{**formats.LEROBOT, "trajectory": None})
     assert len({part.raw.run for part in log.cleaned}) == 3
     assert "the time goes back to 0 s: a run is assumed to start there (2 such rows)" in log.report
