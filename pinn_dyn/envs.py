@@ -253,32 +253,43 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         start, goal = self.np_random.integers(len(self._q), size=2)
         self._goal = self._q[goal].numpy()
-        self._state = self._q[start : start + 1], self._v[start : start + 1]
-        self.plant.start(*self._state)
+        state = self._q[start : start + 1], self._v[start : start + 1]
+        self.plant.start(*state)
+        self._state = np.concatenate([x[0].numpy() for x in state])
         self._count = 0
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold an input ``(M,)``, clipped to its limits, for one step."""
         space = self.action_space
-        u = np.clip(action, space.low, space.high).astype(float)
-        state = self.plant.advance(torch.from_numpy(u)[None], self.dt)
-        diverged = not bool(torch.cat(state).isfinite().all())
+        u = np.minimum(np.maximum(action, space.low), space.high).astype(float)
+        q, v = self.plant.advance(torch.from_numpy(u)[None], self.dt)
+        state = np.concatenate([q[0].numpy(), v[0].numpy()])
+        diverged = not np.isfinite(state).all()
         self._state = self._state if diverged else state
         self._count += 1
-        q, v = (x[0].numpy() for x in self._state)
-        reward = -np.square(q - self._goal).sum() if self.reward is None else self.reward(q, v, u)
+        if self.reward is None:
+            error = self._state[: len(self._goal)] - self._goal
+            reward = -float(error @ error)
+        else:
+            reward = float(self.reward(*self._motion(), u))
         if diverged:
             reward *= self.steps - self._count + 1
         is_over = self._count >= self.steps
-        return self._observation(), float(reward), diverged, is_over, self._info()
+        return self._observation(), reward, diverged, is_over, self._info()
+
+    def _motion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return q and v, ``(N,)`` each."""
+        size = len(self._goal)
+        return self._state[:size], self._state[size:]
 
     def _observation(self) -> np.ndarray:
-        parts = [x[0].numpy() for x in self._state]
-        return np.concatenate([*parts, self._goal] if self.reward is None else parts)
+        if self.reward is None:
+            return np.concatenate([self._state, self._goal])
+        return self._state.copy()
 
     def _info(self) -> dict[str, Any]:
-        return {"distance": float(self.region.distance(*self._state))}
+        return {"distance": self.region.distance_of_state(*self._motion())}
 
 
 class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):

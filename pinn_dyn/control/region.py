@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -70,6 +71,9 @@ class DataRegion:
         drawn = np.random.default_rng(0).choice(len(states), count, replace=False)
         states, trajectory = states[drawn] / self._scale, trajectory[drawn]
         self._tree = scipy.spatial.cKDTree(states)
+        self._center = states.mean(axis=0)
+        self._states = np.ascontiguousarray(states - self._center)
+        self._halves = np.square(self._states).sum(axis=1) / 2
         distances = [
             scipy.spatial.cKDTree(states[trajectory != k]).query(states[trajectory == k])[0]
             for k in np.unique(trajectory)
@@ -86,6 +90,21 @@ class DataRegion:
         finite = np.asarray(np.isfinite(states).all(axis=-1))
         nearest, _ = self._tree.query(np.where(finite[..., None], states, 0.0))
         return torch.as_tensor(np.where(finite, nearest / self.radius, np.nan)).to(q)
+
+    def distance_of_state(self, q: np.ndarray, v: np.ndarray) -> float:
+        """Return :meth:`distance` of one state, ``(N,)`` each, as a number and without tensors."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            x = np.concatenate([q, v])
+            if self.angles:
+                angles = x[self.angles]
+                x = np.concatenate([np.delete(x, self.angles), np.sin(angles), np.cos(angles)])
+            x = x / self._scale - self._center
+            # |x - x_i|^2 / 2 without the constant |x|^2 / 2 finds the nearest state.
+            offset = self._states[(self._halves - self._states @ x).argmin()] - x
+            distance = math.sqrt(offset @ offset) / self.radius
+        if math.isfinite(distance):
+            return distance
+        return float(self.distance(torch.from_numpy(q), torch.from_numpy(v)))
 
     def nearest(self, q: Tensor, v: Tensor) -> Tensor:
         """Return the distance ``()`` of a state ``(N,)`` by tensor operations, for exports."""

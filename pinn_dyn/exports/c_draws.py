@@ -59,7 +59,7 @@ class LoopOfDraws(Loop):
         threads: int = 1,
     ) -> Tensor:
         if len(start) != self._trajectories:
-            lanes = self._library.number_of_lanes()
+            lanes = self._lanes
             index = torch.arange(-(-len(start) // lanes) * lanes) % len(self._of_models)
             self._values = self._of_models[index].unflatten(0, (-1, lanes)).mT.contiguous()
             self._trajectories = len(start)

@@ -9,7 +9,7 @@ import logging
 import pickle
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
@@ -101,6 +101,9 @@ class Loop:
 
     def __init__(self, code: str, values: Tensor):
         self._library, self._values = load_code(code, QUICK), values
+        pointer, size = ctypes.c_void_p, ctypes.c_long
+        self._library.roll_out.argtypes = [pointer, size, size, *[pointer] * 4]
+        self._lanes: int = self._library.number_of_lanes()
 
     def _values_of(self, part: slice) -> Tensor:
         """Return the numbers of a part of the trajectories, which starts with a vector of them."""
@@ -115,24 +118,24 @@ class Loop:
         threads: int = 1,
     ) -> Tensor:
         """Return the increments after the steps, ``(B, T, ...)``, of B trajectories."""
-        path = start.new_empty(len(start), len(lengths) + 1, *start.shape[1:])
+        count = len(start)
+        path = start.new_empty(count, len(lengths) + 1, *start.shape[1:])
         path[:, 0] = increment
-        inputs, lengths = inputs.contiguous(), lengths.contiguous()
+        rows = start, inputs.contiguous(), path
+        lengths = lengths.contiguous()
 
-        def roll_out(part: slice) -> None:
-            rows = start[part], inputs[part], lengths, path[part]
-            pointers = [ctypes.c_void_p(x.data_ptr()) for x in (self._values_of(part), *rows)]
-            sizes = ctypes.c_long(len(rows[0])), ctypes.c_long(len(lengths))
-            self._library.roll_out(pointers[0], *sizes, *pointers[1:])
+        def roll_out(part: slice, rows: Sequence[Tensor]) -> None:
+            x, u, out = (y.data_ptr() for y in rows)
+            sizes, values = (len(rows[0]), len(lengths)), self._values_of(part)
+            self._library.roll_out(values.data_ptr(), *sizes, x, u, lengths.data_ptr(), out)
 
-        lanes: int = self._library.number_of_lanes()
-        size = -(-len(start) // (threads * lanes)) * lanes
-        parts = [slice(k, k + size) for k in range(0, len(start), size)]
-        if len(parts) == 1:
-            roll_out(parts[0])
+        size = -(-count // (threads * self._lanes)) * self._lanes
+        if size >= count:
+            roll_out(slice(0, count), rows)
         else:  # the calls release the interpreter
+            parts = [slice(k, k + size) for k in range(0, count, size)]
             with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(roll_out, parts))
+                list(pool.map(roll_out, parts, ([x[part] for x in rows] for part in parts)))
         return path[:, 1:]
 
 
@@ -342,9 +345,11 @@ def versions_of(module: nn.Module) -> list[tuple[int, int]]:
     """Return the address and the version of each tensor of a module."""
     versions, modules = [], [module]
     for inner in modules:  # grows meanwhile; module.state_dict() takes ten times as long
-        modules.extend(x for x in inner._modules.values() if x is not None)
+        if inner._modules:
+            modules += [x for x in inner._modules.values() if x is not None]
         for table in (inner._parameters, inner._buffers):
-            versions += [(x.data_ptr(), x._version) for x in table.values() if x is not None]
+            if table:
+                versions += [(x.data_ptr(), x._version) for x in table.values() if x is not None]
     return versions
 
 

@@ -205,6 +205,22 @@ def test_terms_are_those_of_the_equation_of_motion(model):
     assert model.terms(np.tile(q, (2, 1))).M.shape == (2, 3, 3)
 
 
+def test_accelerations_of_rows_are_those_of_single_states(model):
+    q, v, u = np.random.default_rng(0).uniform(-0.3, 0.3, (3, 4, 3))
+    expected = np.stack([model.forward_dynamics(q[k], v[0], u[k]) for k in range(4)])
+    np.testing.assert_allclose(model.forward_dynamics(q, v[0], u), expected, rtol=1e-9)
+    bad = u.copy()
+    bad[2, 1] = np.nan
+    with pytest.raises(ValueError, match=r"u has 1 non-finite .* index \(2, 1\)"):
+        model.forward_dynamics(q, v, bad)
+    with pytest.raises(ValueError, match="v has 1 non-finite"):
+        model.forward_dynamics(q[0], [0.0, np.inf, 0.0], u[0])
+    with pytest.raises(ValueError, match=r"v has shape \(2,\), expected \(\*batch, 3\)"):
+        model.forward_dynamics(q[0], v[0, :2], u[0])
+    with pytest.raises(ValueError, match="q holds dates"):
+        model.forward_dynamics(np.zeros(3, "M8[s]"), v[0], u[0])
+
+
 def test_a_black_box_has_no_terms(black_box):
     with pytest.raises(TypeError, match=r"is a black box and has no terms"):
         black_box.terms([0.0, 0.0, 0.3])

@@ -275,7 +275,7 @@ def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
                 continue
             q, v, single._goal = np.split(before[k], 3)
             single.plant.start(torch.from_numpy(q[None]), torch.from_numpy(v[None]))
-            single._state = (torch.from_numpy(q[None]), torch.from_numpy(v[None]))
+            single._state = np.concatenate([q, v])
             expected, reward, ended, _, info = single.step(actions[k])
             np.testing.assert_allclose(observations[k], expected, rtol=0, atol=1e-10)
             assert rewards[k] == pytest.approx(reward, abs=1e-10)
