@@ -11,6 +11,7 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.exports.c_loop import expected_calls
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.progress import Progress
@@ -63,7 +64,11 @@ def close_loop(
     q, v, moving = q0.clone(), v0.clone(), run.running.clone()
     k, pieces = 0, list[tuple[Tensor, float]]()
     try:
-        with torch.no_grad(), Progress(progress, len(run.t), "instants") as lines:
+        with (
+            torch.no_grad(),
+            expected_calls(len(run.t)),
+            Progress(progress, len(run.t), "instants") as lines,
+        ):
             plant.start(q0, v0)
             for k in range(len(run.t)):
                 lines.update(k)
@@ -123,6 +128,7 @@ class LoopRun:
             raise ValueError(f"duration is {duration} s, expected a multiple of {1 / rate:g} s")
         self.t = torch.arange(steps + 1, dtype=torch.float64) / rate
         self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
+        self._all_run = True
         self._shape_of_u = (len(q0), m)
         self._controller, self._actuator = controller, actuator
         self._interval = 1 / rate
@@ -140,17 +146,20 @@ class LoopRun:
 
     def stop(self, mask: Tensor, time: float, reason: str) -> None:
         """Stop the copies of a mask ``(K,)`` that still run."""
+        if not mask.any():
+            return
         for copy in (mask & self.running).nonzero()[:, 0].tolist():
             self._stopped[copy] = f"{reason} at t = {time:.6g} s"
         self.running &= ~mask
+        self._all_run = bool(self.running.all())
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
         """Record the true state at instant k; stop the copies that have diverged."""
         time = float(self.t[k])
         finite = finite_rows(q) & finite_rows(v)
         self.stop(~finite, time, "the plant diverged: its state is not finite")
-        self._q[self.running, k] = q[self.running]
-        self._v[self.running, k] = v[self.running]
+        self._write(self._q[:, k], q)
+        self._write(self._v[:, k], v)
         beyond = (q.abs() > self.q_bound).any(-1)
         self.stop(beyond, time, f"the plant diverged: |q| is beyond {self.q_bound:g}")
 
@@ -159,7 +168,7 @@ class LoopRun:
         finite = finite_rows(q) & finite_rows(v)
         self.stop(~finite, float(self.t[k]), "the measurement is not finite")
         for stored, value in zip(self._measured, (q, v), strict=True):
-            stored[self.running] = value[self.running]
+            self._write(stored, value)
 
     def ask(self, k: int) -> Tensor:
         """Return the law's input at instant k; meaningless for a stopped copy."""
@@ -169,7 +178,7 @@ class LoopRun:
             raise ValueError(
                 f"the controller's input has shape {tuple(u.shape)}, expected {self._shape_of_u}"
             )
-        self._u_wanted[self.running, k] = u[self.running]
+        self._write(self._u_wanted[:, k], u)
         self._diagnose(k, self._controller.diagnostics())
         for reason, mask in self._controller.faults().items():
             self.stop(mask, time, reason)
@@ -181,7 +190,7 @@ class LoopRun:
         if self._actuator is not None:
             u, changed = self._actuator(u, self._interval)
             self._diagnose(k, {"saturated_inputs": changed.sum(-1)})
-        self._u[self.running, k] = u[self.running]
+        self._write(self._u[:, k], u)
         return u
 
     def record(self, samples: int) -> ClosedLoopRecord:
@@ -195,7 +204,14 @@ class LoopRun:
 
     def _diagnose(self, k: int, values: dict[str, Tensor]) -> None:
         for name, value in values.items():
-            self._diagnostics[name][self.running, k] = value[self.running].to(self._q)
+            self._write(self._diagnostics[name][:, k], value.to(self._q))
+
+    def _write(self, target: Tensor, values: Tensor) -> None:
+        """Copy the values of the running copies, ``(K, ...)``, into a part of the record."""
+        if self._all_run:
+            target.copy_(values)
+        else:
+            target[self.running] = values[self.running]
 
 
 def finite_rows(x: Tensor) -> Tensor:

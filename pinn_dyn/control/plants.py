@@ -15,6 +15,7 @@ from pinn_dyn.systems import Stepped
 
 # Far below any step that the motion of a robot needs, s.
 _SMALLEST_STEP = 1e-6
+_SLOPES = 7  # of a step of RK45, and of its start
 
 
 class SystemPlant(Plant):
@@ -42,10 +43,13 @@ class SystemPlant(Plant):
         self._step = np.inf
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        moving = (self._x.isfinite() & u.isfinite().all(-1, keepdim=True)).all(-1)
-        self._x[~moving] = torch.nan
-        if moving.any():
-            self._x[moving] = self._solve(self._x[moving], u[moving], duration)
+        moving = self._x.isfinite().all(-1) & u.isfinite().all(-1)
+        if moving.all():
+            self._x = self._solve(self._x, u, duration)
+        else:
+            self._x[~moving] = torch.nan
+            if moving.any():
+                self._x[moving] = self._solve(self._x[moving], u[moving], duration)
         q, v = self._x.chunk(2, dim=-1)
         return q.clone(), v.clone()
 
@@ -56,10 +60,13 @@ class SystemPlant(Plant):
         def rates(rows: Tensor) -> Tensor:
             return self._system.velocity_derivative(rows[..., :size], rows[..., size:])
 
+        rows = torch.cat([x, u], dim=-1)
+        with torch.no_grad():
+            fast = rows_in_c(self._system, "velocity_derivative", rates, rows, calls=_SLOPES)
+
         def slope(time: float, flat: np.ndarray) -> np.ndarray:
-            rows = torch.cat([torch.from_numpy(flat).reshape(x.shape), u], dim=-1)
+            rows[:, :size] = torch.from_numpy(flat).view(x.shape)
             with torch.no_grad():
-                fast = rows_in_c(self._system, "velocity_derivative", rates, rows)
                 return fast(rows).numpy().ravel()
 
         share = len(x) ** -0.5  # SciPy takes the root mean square over all copies

@@ -8,11 +8,14 @@ import hashlib
 import logging
 import pickle
 import sys
+import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 from weakref import WeakKeyDictionary
 
@@ -38,6 +41,8 @@ STEPS = 1500
 and building a loop up to 12 s (benchmarks/long_rollout.py)."""
 TRAJECTORIES = 100
 """Number of trajectories with which a step in Python takes twice as long as with one."""
+BUILD_SECONDS = 1.0
+"""Time that functions of rows must take in Python, s, for code in C before :data:`STEPS` calls."""
 NUMBERS = 2**21
 """Number of inputs that are computed at once, to limit the memory of large batches."""
 SEVERAL_FROM = 4
@@ -273,6 +278,8 @@ _WITHOUT: Counter[str] = Counter()
 """Steps that were taken without a loop."""
 _KEYS: WeakKeyDictionary[nn.Module | CLoop, tuple[list[Any], str]] = WeakKeyDictionary()
 _MOST_LOOPS = 64
+_EXPECTED = SimpleNamespace(count=0)
+"""Number of calls of each function of rows that will follow, 0 if unknown."""
 
 
 def _loop_of(
@@ -311,8 +318,23 @@ def _loop_of(
     return _LOOPS[key]
 
 
+@contextmanager
+def expected_calls(count: int) -> Iterator[None]:
+    """Tell :func:`rows_in_c` within a context how many calls of each function will follow."""
+    before = _EXPECTED.count
+    _EXPECTED.count = count
+    try:
+        yield
+    finally:
+        _EXPECTED.count = before
+
+
 def rows_in_c(
-    model: nn.Module, name: str, function: Callable[[Tensor], Tensor], rows: Tensor
+    model: nn.Module,
+    name: str,
+    function: Callable[[Tensor], Tensor],
+    rows: Tensor,
+    calls: PositiveInt = 1,
 ) -> Callable[[Tensor], Tensor]:
     """Return a function of a model for rows, in C if that pays off, see :func:`compiled_rows`.
 
@@ -321,6 +343,7 @@ def rows_in_c(
         name: name of the function, also of the settings that are not in the model.
         function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently.
         rows: the next argument of the function, ``(*batch, n)``.
+        calls: number of calls until this question is asked again.
     """
     if not rows.numel() or rows.dtype != torch.float64 or not rows.is_cpu:
         return function
@@ -331,14 +354,27 @@ def rows_in_c(
         return function
     if key not in _ROWS:
         is_new, count = key not in _WITHOUT, rows.shape[:-1].numel()
-        _WITHOUT[key] += 1 + count // TRAJECTORIES
-        is_worth = _WITHOUT[key] >= STEPS or (is_new and recall(key) is not None)
+        _WITHOUT[key] += calls * (1 + count // TRAJECTORIES)
+        is_worth = _WITHOUT[key] >= STEPS
+        if is_new and not is_worth:
+            seconds = _seconds_of_calls(function, rows, calls)
+            is_worth = seconds > BUILD_SECONDS or recall(key) is not None
         if not is_worth or find_compiler() is None:
             return function
         if len(_ROWS) >= _MOST_LOOPS:
             _ROWS.clear()
         _ROWS[key] = compiled_rows(function, rows.reshape(-1, rows.shape[-1])[0], key)
     return _ROWS[key]
+
+
+def _seconds_of_calls(function: Callable[[Tensor], Tensor], rows: Tensor, calls: int) -> float:
+    """Return the time of all expected calls in Python, s, or 0 if their number is not known."""
+    if _EXPECTED.count == 0:
+        return 0.0
+    function(rows)  # the first call may import and build
+    start = time.thread_time()
+    function(rows)
+    return (time.thread_time() - start) * calls * _EXPECTED.count
 
 
 def versions_of(module: nn.Module) -> list[tuple[int, int]]:

@@ -297,3 +297,24 @@ def test_rows_of_a_model_are_compiled_once_for_all_processes(monkeypatch, cached
     with torch.no_grad():
         next(model.parameters()).add_(0.1)
     assert c_loop.rows_in_c(model, "a", function, rows) is function
+
+
+def test_code_of_rows_is_built_at_once_for_many_expected_calls(monkeypatch):
+    monkeypatch.setattr(c_loop, "STEPS", 10**6)
+    monkeypatch.setattr(c_loop, "_ROWS", {})
+    model = make_structured("lnn", **NETWORK).double().eval().requires_grad_(False)
+    rows = torch.rand(4, 9, generator=torch.Generator().manual_seed(2)).double()
+
+    def function(x):
+        return model.forward_dynamics(*x.chunk(3, dim=-1))
+
+    def is_built(name):
+        return c_loop.rows_in_c(model, name, function, rows) is not function
+
+    with c_loop.expected_calls(1000):
+        monkeypatch.setattr(c_loop, "BUILD_SECONDS", 1e3)
+        assert not is_built("slow")
+        monkeypatch.setattr(c_loop, "BUILD_SECONDS", 1e-3)
+        assert is_built("fast")
+        assert not is_built("slow")  # the time of calls in Python was measured once
+    assert not is_built("other")
