@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
 from pinn_dyn.whole import whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # The palette of Okabe and Ito, which color-blind readers can tell apart.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -52,6 +53,8 @@ def panels(
     """
     filled = [labels for labels in columns if labels]
     rows = max(map(len, filled))
+    from matplotlib.figure import Figure  # takes a quarter of a second
+
     figure = Figure(figsize=(5.8 * len(filled), 1.55 * rows + 1.3), layout="constrained")
     grid = figure.subplots(rows, len(filled), sharex=True, squeeze=False)
     shown = iter(grid.T)
@@ -108,6 +111,8 @@ def set_log_axis(ax: Axes, curves: Sequence[Tensor]) -> None:
     low, high = log_limits(curves)
     ax.set_ylim(low, high)
     if high > 10 * low:
+        from matplotlib.ticker import NullFormatter
+
         ax.yaxis.set_minor_formatter(NullFormatter())
 
 
@@ -129,6 +134,8 @@ def mean_error_figure(
         title, note, label: titles of figure and legend, name and unit of the error.
         lost: word for excluded trajectories, such as "diverged", which the legend counts.
     """
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     ax = figure.subplots()
     styles = [model_style(k) | {"linewidth": 1.8} for k in range(len(models))]

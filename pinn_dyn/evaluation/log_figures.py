@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from pinn_dyn.data.logs import Cleaned
 from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def cleaning_figure(

@@ -7,10 +7,10 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs.check.averages import PARTS, Averages
@@ -29,6 +29,9 @@ from pinn_dyn.evaluation.report.page import (
 from pinn_dyn.identification.rigid_excitation import RigidExcitation
 from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels
 from pinn_dyn.whole import write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _ROWS = 50  # of a table in the terminal
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
@@ -236,6 +239,8 @@ def _forces(check: LogCheck) -> Figure:
 
 
 def _delays(check: LogCheck) -> Figure:
+    from matplotlib.figure import Figure  # takes a quarter of a second
+
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     ax = figure.subplots()
     for k, (name, curve) in enumerate(zip(check.inputs["input"], check.delays, strict=True)):

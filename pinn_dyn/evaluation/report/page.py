@@ -8,15 +8,16 @@ import html
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import markdown
 import pandas as pd
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.tables import best, formatted
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _TEMPLATES = Environment(
     loader=PackageLoader("pinn_dyn.evaluation.report"),
@@ -83,6 +84,8 @@ def details(summary: str, *content: Markup) -> Markup:
 
 def from_markdown(text: str) -> Markup:
     """Convert a Markdown report: headings from the third level on, HTML and links as text."""
+    import markdown  # takes a tenth of a second
+
     reader = markdown.Markdown(
         extensions=["tables", "toc"], extension_configs={"toc": {"baselevel": 3}}
     )
