@@ -68,3 +68,23 @@ assert not may_build("pinn_dyn.evaluation.Path", ()), "not public"
 """
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert process.returncode == 0, process.stderr
+
+
+def test_a_log_is_checked_without_the_imports_of_its_page():
+    code = """
+import sys
+sys.modules.update(hydra=None, lightning=None, matplotlib=None, markdown=None)
+from pinn_dyn.data import LogSource
+from pinn_dyn.log_check.check import check
+source = LogSource(
+    files="examples/example_log.csv",
+    trajectory="run",
+    time={"columns": "t", "unit": "s"},
+    q={"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]},
+    u={"columns": ["torque_x", "torque_y", "force"], "unit": ["Nm", "Nm", "N"]},
+)
+assert check(source).problems == []
+"""
+    command = [sys.executable, "-c", code]
+    process = subprocess.run(command, capture_output=True, check=False, cwd=ROOT)
+    assert process.returncode == 0, process.stderr
