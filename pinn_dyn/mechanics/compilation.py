@@ -203,6 +203,7 @@ def _keep_rows() -> None:
 
 
 _OPTIONS: dict[str, Any] = {"cpp.threads": 1, "cpp_wrapper": True}
+_OPTIONS |= {"cpp.enable_floating_point_contract_flag": "fast"}  # a * b + c is one operation
 _OPTIONS |= {"post_grad_fusion_options": {"decompose_mm_pass": {}}}
 # One block of memory per call instead of a hundred, which take 8 % of a step at N = 3.
 _PLANNED = {"memory_planning": True, "memory_pool": "intermediates"}
