@@ -263,16 +263,14 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Hold an input ``(M,)``, clipped to its limits, for one step."""
         space = self.action_space
         u = np.minimum(np.maximum(action, space.low), space.high).astype(float)
-        q, v = self.plant.advance(torch.from_numpy(u)[None], self.dt)
-        state = np.concatenate([q[0].numpy(), v[0].numpy()])
+        motion = self.plant.advance(torch.from_numpy(u)[None], self.dt)
+        state = np.concatenate([x[0].numpy() for x in motion])
         diverged = not np.isfinite(state).all()
         self._state = self._state if diverged else state
         self._count += 1
-        if self.reward is None:
-            error = self._state[: len(self._goal)] - self._goal
-            reward = -float(error @ error)
-        else:
-            reward = float(self.reward(*self._motion(), u))
+        q, v = self._motion()
+        error = q - self._goal
+        reward = float(-error @ error if self.reward is None else self.reward(q, v, u))
         if diverged:
             reward *= self.steps - self._count + 1
         is_over = self._count >= self.steps
@@ -284,9 +282,8 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._state[:size], self._state[size:]
 
     def _observation(self) -> np.ndarray:
-        if self.reward is None:
-            return np.concatenate([self._state, self._goal])
-        return self._state.copy()
+        parts = [self._state, self._goal] if self.reward is None else [self._state]
+        return np.concatenate(parts)
 
     def _info(self) -> dict[str, Any]:
         return {"distance": self.region.distance_of_state(*self._motion())}

@@ -128,7 +128,6 @@ class LoopRun:
             raise ValueError(f"duration is {duration} s, expected a multiple of {1 / rate:g} s")
         self.t = torch.arange(steps + 1, dtype=torch.float64) / rate
         self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
-        self._all_run = True
         self._shape_of_u = (len(q0), m)
         self._controller, self._actuator = controller, actuator
         self._interval = 1 / rate
@@ -151,7 +150,6 @@ class LoopRun:
         for copy in (mask & self.running).nonzero()[:, 0].tolist():
             self._stopped[copy] = f"{reason} at t = {time:.6g} s"
         self.running &= ~mask
-        self._all_run = bool(self.running.all())
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
         """Record the true state at instant k; stop the copies that have diverged."""
@@ -208,7 +206,7 @@ class LoopRun:
 
     def _write(self, target: Tensor, values: Tensor) -> None:
         """Copy the values of the running copies, ``(K, ...)``, into a part of the record."""
-        if self._all_run:
+        if not any(self._stopped):
             target.copy_(values)
         else:
             target[self.running] = values[self.running]

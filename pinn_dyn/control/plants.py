@@ -44,12 +44,9 @@ class SystemPlant(Plant):
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
         moving = self._x.isfinite().all(-1) & u.isfinite().all(-1)
-        if moving.all():
-            self._x = self._solve(self._x, u, duration)
-        else:
-            self._x[~moving] = torch.nan
-            if moving.any():
-                self._x[moving] = self._solve(self._x[moving], u[moving], duration)
+        self._x[~moving] = torch.nan
+        if moving.any():
+            self._x[moving] = self._solve(self._x[moving], u[moving], duration)
         q, v = self._x.chunk(2, dim=-1)
         return q.clone(), v.clone()
 

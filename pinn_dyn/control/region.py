@@ -102,9 +102,8 @@ class DataRegion:
             # |x - x_i|^2 / 2 without the constant |x|^2 / 2 finds the nearest state.
             offset = self._states[(self._halves - self._states @ x).argmin()] - x
             distance = math.sqrt(offset @ offset) / self.radius
-        if math.isfinite(distance):
-            return distance
-        return float(self.distance(torch.from_numpy(q), torch.from_numpy(v)))
+        is_finite = math.isfinite(distance)
+        return distance if is_finite else float(self.distance(*map(torch.from_numpy, (q, v))))
 
     def nearest(self, q: Tensor, v: Tensor) -> Tensor:
         """Return the distance ``()`` of a state ``(N,)`` by tensor operations, for exports."""

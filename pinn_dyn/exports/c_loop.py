@@ -356,25 +356,19 @@ def rows_in_c(
         is_new, count = key not in _WITHOUT, rows.shape[:-1].numel()
         _WITHOUT[key] += calls * (1 + count // TRAJECTORIES)
         is_worth = _WITHOUT[key] >= STEPS
-        if is_new and not is_worth:
-            seconds = _seconds_of_calls(function, rows, calls)
-            is_worth = seconds > BUILD_SECONDS or recall(key) is not None
+        if is_new and not is_worth and _EXPECTED.count:
+            function(rows)  # the first call may import and build
+            start = time.thread_time()
+            function(rows)
+            seconds = (time.thread_time() - start) * calls * _EXPECTED.count
+            is_worth = seconds > BUILD_SECONDS
+        is_worth = is_worth or (is_new and recall(key) is not None)
         if not is_worth or find_compiler() is None:
             return function
         if len(_ROWS) >= _MOST_LOOPS:
             _ROWS.clear()
         _ROWS[key] = compiled_rows(function, rows.reshape(-1, rows.shape[-1])[0], key)
     return _ROWS[key]
-
-
-def _seconds_of_calls(function: Callable[[Tensor], Tensor], rows: Tensor, calls: int) -> float:
-    """Return the time of all expected calls in Python, s, or 0 if their number is not known."""
-    if _EXPECTED.count == 0:
-        return 0.0
-    function(rows)  # the first call may import and build
-    start = time.thread_time()
-    function(rows)
-    return (time.thread_time() - start) * calls * _EXPECTED.count
 
 
 def versions_of(module: nn.Module) -> list[tuple[int, int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -19,6 +20,8 @@ def require_last_dim(name: str, value: Tensor, size: int, symbol: str) -> None:
 
 def require_finite(name: str, value: Tensor) -> None:
     """Check that a value is finite."""
+    if math.isfinite(value.detach().sum()):  # several times faster than all entries
+        return
     bad = ~torch.isfinite(value)
     if bad.any():
         first = tuple(int(i) for i in bad.nonzero()[0])

@@ -202,8 +202,11 @@ def _keep_rows() -> None:
     lowering.add_layout_constraint(solve, lowering.constrain_to_fx_strides)
 
 
-_OPTIONS: dict[str, Any] = {"cpp.threads": 1, "cpp_wrapper": True}
-_OPTIONS |= {"cpp.enable_floating_point_contract_flag": "fast"}  # a * b + c is one operation
+_OPTIONS: dict[str, Any] = {
+    "cpp.threads": 1,
+    "cpp_wrapper": True,
+    "cpp.enable_floating_point_contract_flag": "fast",  # a * b + c is one operation
+}
 _OPTIONS |= {"post_grad_fusion_options": {"decompose_mm_pass": {}}}
 # One block of memory per call instead of a hundred, which take 8 % of a step at N = 3.
 _PLANNED = {"memory_planning": True, "memory_pool": "intermediates"}

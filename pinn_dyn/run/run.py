@@ -456,23 +456,15 @@ class Run:
 
     def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
         """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``."""
-        n, m = self.model.num_coordinates, self.model.num_inputs
-        given = {
-            "q": self._sized("q", _unchecked("q", q), n, "N"),
-            "v": self._sized("v", _unchecked("v", v), n, "N"),
-            "u": self._sized("u", _unchecked("u", u), m, "M"),
-        }
-        parts = [*given.values()]
-        if any(x.ndim > 1 for x in parts):
-            batch = torch.broadcast_shapes(*(x.shape[:-1] for x in parts))
+        parts = [self._coordinates("q", q), self._coordinates("v", v)]
+        parts.append(self._array("u", u, self.model.num_inputs, "M"))
+        if any(x.ndim > 1 for x in parts):  # not for a single state, where it takes long
+            batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
             parts = [x.expand(*batch, -1) for x in parts]
         rows = torch.cat(parts, dim=-1)
-        if not np.isfinite(rows.numpy()).all():
-            for name, value in given.items():
-                require_finite(name, value)
         is_system = isinstance(self.model, MechanicalSystem)
         model: Any = self._for_rollouts() if is_system else self.system
-        sizes = [n, n, m]
+        sizes = [x.shape[-1] for x in parts]
 
         def function(x: Tensor) -> Tensor:
             acceleration: Tensor = model.forward_dynamics(*x.split(sizes, dim=-1))
@@ -511,9 +503,7 @@ class Run:
         return self._array(name, value, self.model.num_coordinates, "N")
 
     def _array(self, name: str, value: Values, size: int, symbol: str) -> Tensor:
-        return self._sized(name, _tensor(name, value), size, symbol)
-
-    def _sized(self, name: str, tensor: Tensor, size: int, symbol: str) -> Tensor:
+        tensor = _tensor(name, value)
         if tensor.ndim == 0 or tensor.shape[-1] != size:
             labels: Sequence[str] = self.input_labels if symbol == "M" else self.labels
             raise ValueError(
@@ -524,16 +514,12 @@ class Run:
 
 
 def _tensor(name: str, value: Values) -> Tensor:
-    tensor = _unchecked(name, value)
+    if isinstance(value, Tensor):
+        tensor = value.detach().cpu().double()
+    else:
+        array = np.asarray(value)
+        if array.dtype.kind in "mM":
+            raise ValueError(f"{name} holds dates or durations, expected numbers in SI units")
+        tensor = torch.from_numpy(np.array(array, dtype=float))
     require_finite(name, tensor)
     return tensor
-
-
-def _unchecked(name: str, value: Values) -> Tensor:
-    """Return numbers as a tensor, which may not be finite."""
-    if isinstance(value, Tensor):
-        return value.detach().cpu().double()
-    array = np.asarray(value)
-    if array.dtype.kind in "mM":
-        raise ValueError(f"{name} holds dates or durations, expected numbers in SI units")
-    return torch.from_numpy(np.array(array, dtype=float))
