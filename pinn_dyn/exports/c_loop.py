@@ -123,15 +123,15 @@ class Loop:
         threads: int = 1,
     ) -> Tensor:
         """Return the increments after the steps, ``(B, T, ...)``, of B trajectories."""
-        count = len(start)
-        path = start.new_empty(count, len(lengths) + 1, *start.shape[1:])
+        count, steps = start.shape[0], lengths.shape[0]  # several times faster than len(x)
+        path = start.new_empty(count, steps + 1, *start.shape[1:])
         path[:, 0] = increment
         rows = start, inputs.contiguous(), path
         lengths = lengths.contiguous()
 
         def roll_out(part: slice, rows: Sequence[Tensor]) -> None:
             x, u, out = (y.data_ptr() for y in rows)
-            sizes, values = (len(rows[0]), len(lengths)), self._values_of(part)
+            sizes, values = (rows[0].shape[0], steps), self._values_of(part)
             self._library.roll_out(values.data_ptr(), *sizes, x, u, lengths.data_ptr(), out)
 
         size = -(-count // (threads * self._lanes)) * self._lanes
