@@ -51,10 +51,10 @@ def panels(
     ``columns`` has the label of the vertical axis of each panel, for each column. A column without
     panels takes no place.
     """
-    filled = [labels for labels in columns if labels]
-    rows = max(map(len, filled))
     from matplotlib.figure import Figure  # takes a quarter of a second
 
+    filled = [labels for labels in columns if labels]
+    rows = max(map(len, filled))
     figure = Figure(figsize=(5.8 * len(filled), 1.55 * rows + 1.3), layout="constrained")
     grid = figure.subplots(rows, len(filled), sharex=True, squeeze=False)
     shown = iter(grid.T)

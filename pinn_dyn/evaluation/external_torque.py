@@ -17,6 +17,7 @@ from torch import Tensor
 from pinn_dyn.control.observer import DisturbanceObserver, rest_speeds
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
+from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels, save
 from pinn_dyn.systems import RigidChain
 
 if TYPE_CHECKING:
@@ -56,8 +57,6 @@ class ExternalTorque:
 
     def figure(self, run: str | None = None) -> Figure:
         """Draw the torques of a run, the first by default, with thresholds and contacts."""
-        from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels  # imports matplotlib
-
         run = self.table["run"].iloc[0] if run is None else run
         rows = self.table[self.table["run"] == run]
         t, joints = rows["time"].to_numpy(), list(self.threshold.index)
@@ -83,8 +82,6 @@ class ExternalTorque:
 
     def save(self, path: str | Path) -> None:
         """Write the figure of the first run as PNG."""
-        from pinn_dyn.plots import save
-
         save(self.figure(), Path(path).expanduser())
 
 

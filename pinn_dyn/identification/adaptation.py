@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import KnownMechanics
+from pinn_dyn.plots import COLORS, legend_below, panels, save
 from pinn_dyn.training.filtered_motion import filtered_motion
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ class Adaptation:
 
     def figure(self, run: str | None = None) -> Figure:
         """Draw the constants of a run over time, the first run by default."""
-        from pinn_dyn.plots import COLORS, legend_below, panels  # imports matplotlib
-
         table = self.table
         run = table["run"].iloc[0] if run is None else run
         parts = dict(iter(table[table["run"] == run].groupby("name", sort=False)))
@@ -62,8 +61,6 @@ class Adaptation:
 
     def save(self, path: str | Path) -> None:
         """Write the figure of the first run as PNG."""
-        from pinn_dyn.plots import save
-
         save(self.figure(), Path(path).expanduser())
 
 
