@@ -13,7 +13,9 @@ from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics import Predictor, Signal
+from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import Activation
+from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -57,7 +59,8 @@ class EncodedPredictor(Predictor):
     Symbols: latent state z ``(*batch, latent)``, state y of the robot ``(*batch, 2N)``, fade
     ``(2N,)``. y, q and u are normalized by their means and standard deviations. The encoder and the
     output are sums of a linear map and an MLP. The last term starts the prediction at the measured
-    y_0. fade is learned, between 0 and 1. Subclasses define how z moves (:meth:`latent_path`).
+    y_0. fade is learned, between 0 and 1. A learned v_0 replaces the measured one. Subclasses
+    define how z moves (:meth:`latent_path`).
 
     Unknown q and u before the start repeat the first sample: the robot was at rest. The memory of a
     rollout is z and the fading term, see :meth:`start` and :meth:`next_state`.
@@ -71,6 +74,9 @@ class EncodedPredictor(Predictor):
             Pieces of a log keep 2 s.
         latent: size of z.
         hidden, activation: widths and activation of the hidden layers of all networks.
+        fade: initial value of fade. Trainings change it by little: 0.95 keeps an offset for two
+            seconds of steps of 0.1 s.
+        initial_velocity: builder of the head for v_0.
     """
 
     mean: Tensor
@@ -84,6 +90,8 @@ class EncodedPredictor(Predictor):
         latent: int,
         hidden: Sequence[PositiveInt],
         activation: Activation,
+        fade: float = 0.5,
+        initial_velocity: InitialVelocityHead | None = None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs)
@@ -93,10 +101,12 @@ class EncodedPredictor(Predictor):
             q, v, u = values.float().split([size, size, inputs])
             self.register_buffer(name, torch.cat([q, v, *[q] * n, *[u] * (n + 1)]))
         self.register_buffer("step", torch.tensor(statistics.step, dtype=torch.float64))
-        self.encoder = LinearAndMLP(len(self.mean), latent, hidden, activation)
+        self.encoder: nn.Module = LinearAndMLP(len(self.mean), latent, hidden, activation)
         self._add_transition(inputs, latent, hidden, activation)
-        self.output = LinearAndMLP(latent, 2 * size, hidden, activation)
-        self.fade = nn.Parameter(torch.zeros(2 * size))
+        self.output: nn.Module = LinearAndMLP(latent, 2 * size, hidden, activation)
+        self.fade = nn.Parameter(torch.logit(torch.full((2 * size,), fade)))
+        scales = Scales(statistics, statistics.v_std)
+        self.initial_velocity = initial_velocity and initial_velocity(scales)
         self.memory_size = latent + 2 * size
 
     @abc.abstractmethod
@@ -127,7 +137,8 @@ class EncodedPredictor(Predictor):
             q_past, u_past: q and u of the n steps before, the latest first, ``(*batch, n N)`` and
                 ``(*batch, n M)``.
         """
-        x = (torch.cat([q, v, q_past, u, u_past], dim=-1) - self.mean) / self.std
+        start = start_of(self.initial_velocity, torch.cat([q, v], dim=-1), u)
+        x = (torch.cat([start, q_past, u, u_past], dim=-1) - self.mean) / self.std
         z = self.encoder(x)
         return torch.cat([z, x[..., : 2 * self.num_coordinates] - self.output(z)], dim=-1)
 
@@ -161,16 +172,19 @@ class EncodedPredictor(Predictor):
         size, n = self.num_coordinates, self.past_steps
         before = t[0] - self.step.to(t) * torch.arange(n + 1, device=t.device)
         at_rest = [x0[..., :size]] * n  # cut off if the past is known
-        past = torch.cat([x0, *at_rest], dim=-1)[..., : (2 + n) * size]
-        past = torch.cat([past, *input.at(before).to(x0)], dim=-1)
+        u_past = input.at(before).to(x0)
+        measured, q_past = torch.cat([x0, *at_rest], dim=-1).tensor_split([2 * size], dim=-1)
+        start = start_of(self.initial_velocity, measured, u_past[0])
+        past = torch.cat([start, q_past[..., : n * size], *u_past], dim=-1)
         z = self.encoder((past - self.mean) / self.std)
         ends = torch.cat(input.stages(t, (0.0, 1.0)).to(x0).unbind(1), dim=-1)
         ends = (ends - self._input_mean) / self._input_std
         y = self.output(torch.stack(self.latent_path(z, ends), dim=-2))
         mean, std = self.mean[: 2 * size], self.std[: 2 * size]
-        offset = (x0[..., None, : 2 * size] - mean) / std - y[..., :1, :]
+        offset = (start.unsqueeze(-2) - mean) / std - y[..., :1, :]
         steps = torch.arange(len(t), device=t.device)[:, None]
-        return std * (y - y[..., :1, :] + offset * (torch.sigmoid(self.fade) ** steps - 1))
+        moved = y - y[..., :1, :] + offset * (torch.sigmoid(self.fade) ** steps - 1)
+        return std * moved + (steps > 0) * (start - measured).unsqueeze(-2)
 
 
 class SubspaceEncoder(EncodedPredictor):
@@ -190,8 +204,9 @@ class SubspaceEncoder(EncodedPredictor):
         latent: PositiveInt = 12,
         hidden: Sequence[PositiveInt] = (64,),
         activation: Activation = "tanh",
+        fade: Annotated[float, Field(gt=0, lt=1)] = 0.5,
     ):
-        super().__init__(statistics, history, latent, hidden, activation)
+        super().__init__(statistics, history, latent, hidden, activation, fade)
 
     def _add_transition(
         self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation

@@ -12,14 +12,20 @@ from pinn_dyn.testing import LinearSystem, damped_oscillators
 from tests.models.builders import STEP, make_statistics
 
 
-@pytest.fixture(scope="module")
-def model():
+def make_oscillators(output):
     torch.manual_seed(2)
-    model = CoupledOscillators(make_statistics(2, 2), oscillators=6, hidden=[8], force_hidden=[8])
+    sizes = {"oscillators": 6, "hidden": [8], "force_hidden": [8]}
+    model = CoupledOscillators(make_statistics(2, 2), output=output, **sizes)
+    parts = [model.output, model.force] if output == "network" else [model.force]
     with torch.no_grad():
-        for part in (model.output, model.force):  # nearly linear, so that set points can be held
+        for part in parts:  # nearly linear, so that set points can be held
             part.layers[-1].weight.mul_(0.2)
     return model.double().requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make_oscillators("network")
 
 
 class Oscillators(Plant):
@@ -34,7 +40,7 @@ class Oscillators(Plant):
             value = getattr(self.model, name)
             noise = torch.randn(value.shape, generator=generator, dtype=value.dtype)
             value.add_(0.05 * noise.tril())
-        self.model.output.first.bias[:2].add_(0.1)
+        self.model.mean[:2].add_(0.1 * self.model.std[:2])
 
     def start(self, q0, v0):
         u = torch.zeros_like(q0)
@@ -93,6 +99,13 @@ def test_the_steady_state_error_vanishes_with_a_wrong_model(model, periods, shar
     assert (found[:, -1] < 1e-3 * steps).all()
     wrong = model.rest(law._u_d)[1] + law._d
     assert (wrong - model.rest(law._u_d)[1]).norm() > 0.01 * steps.min()  # the model was wrong
+
+
+def test_the_steady_state_error_vanishes_in_measured_coordinates():
+    model = make_oscillators("coordinates")
+    law = LatentLaw(model, 0.5, 0.5 * STEP, 0.2 / STEP, noise=0.01)
+    found, steps = errors(model, law)
+    assert (found[:, -1] < 1e-3 * steps).all()
 
 
 @pytest.mark.parametrize("gain", [10.0, 1000.0])

@@ -30,9 +30,10 @@ MODELS = {
     "next_state": lambda: make_model("next_state"),
     "subnet": lambda: make_model("subnet"),
     "oscillators": lambda: make_model("oscillators"),
+    "measured_oscillators": lambda: make_model("measured_oscillators"),
 }
 CONSTANT = "constant-mass-fixed-damping-constant-input-3x3"
-FAST = (CONSTANT, "acceleration", "next_state", "oscillators")
+FAST = (CONSTANT, "acceleration", "next_state", "oscillators", "measured_oscillators")
 CASES = [pytest.param(x, marks=() if x in FAST else pytest.mark.slow, id=x) for x in MODELS]
 
 

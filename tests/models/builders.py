@@ -18,6 +18,7 @@ from pinn_dyn.models import (
     FixedInput,
     HamiltonianNetwork,
     LagrangianNetwork,
+    LearnedVelocity,
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
@@ -158,6 +159,13 @@ def make_model(kind, n=2, m=2, dtype=torch.float64):
         "acceleration": AccelerationMLP,
         "subnet": partial(SubspaceEncoder, history=3 * STEP, latent=5),
         "oscillators": partial(CoupledOscillators, oscillators=3, force_hidden=[4]),
+        "measured_oscillators": partial(
+            CoupledOscillators,
+            oscillators=4,
+            force_hidden=[4],
+            output="coordinates",
+            initial_velocity=partial(LearnedVelocity, hidden=[4]),
+        ),
     }[kind]
     return perturb(black_box(make_statistics(n, m), hidden=[6, 5]).to(dtype))
 

@@ -1,4 +1,4 @@
-"""Properties of all six models: batch shapes, precision, saving, copying, compiling."""
+"""Properties of all models: batch shapes, precision, saving, copying, compiling."""
 
 import copy
 import io
@@ -11,8 +11,16 @@ from pinn_dyn.mechanics import Signal
 from pinn_dyn.testing import assert_near
 from tests.models.builders import STEP, make_model, perturb, random_batch
 
-KINDS = ["lnn", "hnn", "next_state", "acceleration", "subnet", "oscillators"]
-DISCRETE = ("next_state", "subnet", "oscillators")
+KINDS = [
+    "lnn",
+    "hnn",
+    "next_state",
+    "acceleration",
+    "subnet",
+    "oscillators",
+    "measured_oscillators",
+]
+DISCRETE = ("next_state", "subnet", "oscillators", "measured_oscillators")
 T = STEP * torch.arange(4, dtype=torch.float64)
 
 
