@@ -54,6 +54,10 @@ def of_arm_1_wide(folder):
     return [*of_arm_1(folder), "data.steps=1"]  # windows of 20 steps are longer than the motions
 
 
+def of_short_windows(folder):
+    return [*of_arm_1(folder), "data.steps=5"]
+
+
 def of_arm_2(folder):
     short = ["dataset.test_duration=0.2", "dataset.keep_every=1", "dataset.compile=false"]
     return [*TINY_DATA, STRIDE, *short]
@@ -83,6 +87,7 @@ DATA = {
     "soft_arm_1": of_arm_1,
     "soft_arm_1_wide": of_arm_1_wide,
     "soft_arm_2": of_arm_2,
+    "oscillators": of_short_windows,
     "soft_arm_tendon": of_tendons,
     "panda": of_panda,
     "demo": of_arm_1,
