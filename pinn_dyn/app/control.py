@@ -135,13 +135,12 @@ def _without_robot(
 ) -> float:
     """Export the law on a model of measured data, and write how well it is conditioned."""
     source = run.source
-    if isinstance(learned, CoupledOscillators):
-        raise ConfigError(
-            f"{source.name} has no simulated robot, and a law on oscillators has no file: export "
-            "the model with run.export, or use pinn_dyn.control.LatentLaw in Python"
-        )
     if config["export"]:
         _export(_law(config["exported_law"], run, config, learned, learned), run, config)
+    if isinstance(learned, CoupledOscillators):
+        if not config["export"]:
+            raise ConfigError(f"{source.name} has no simulated robot: export the law, export=law.c")
+        return float("nan")
     q = torch.cat([_thinned(item.q) for item in source.load().train])
     table = term_conditions(learned, q)
     table.to_csv(folder / "conditions.csv", index=False)
@@ -160,7 +159,7 @@ def _law(
     run: Run,
     config: dict[str, Any],
     learned: MechanicalSystem | CoupledOscillators,
-    truth: MechanicalSystem,
+    truth: MechanicalSystem | CoupledOscillators,
 ) -> Controller:
     """Build a law with its observer, guard and compensation of the delay, for loop and export."""
     law = build_law(config, name, learned, truth)
@@ -245,7 +244,7 @@ def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Referenc
 
 
 def build_law(
-    config: dict[str, Any], name: str, learned: Predictor, truth: MechanicalSystem
+    config: dict[str, Any], name: str, learned: Predictor, truth: Predictor
 ) -> Controller:
     """Build one of ``config["controllers"]`` on the terms that it names, with its observer."""
     part = config["controllers"][name]

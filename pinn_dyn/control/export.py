@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from pinn_dyn.control.contracts import Controller
 from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.safe_law import SafeLaw
@@ -34,7 +36,7 @@ def export_law(
     """Write a law to a ``.c`` (with ``.h``), ``.onnx`` or ``.casadi`` file, see docs/realtime.md.
 
     The file holds the :class:`~.safe_law.SafeLaw`, which is the law with its observer, its guard
-    and the limits of the input, and explicit memory.
+    and the limits of the input, and explicit memory. That of a LatentLaw includes its estimate.
 
     Args:
         controller: a law of a model in float64 on the CPU, also with an observer or a guard.
@@ -61,7 +63,7 @@ def export_law(
     model, n = safe.law.model, safe.law.num_coordinates
     inputs = drawn_states({**dict.fromkeys(INPUTS, n), "memory_in": safe.memory_size}, ranges)
     begin = safe.stored_inputs
-    if safe.observer:
+    if safe.observer or safe.latent:
         inputs["memory_in"][:, begin : begin + 1].round_()  # called before or not
     info = {
         "law": type(safe.law).__name__,
@@ -74,7 +76,8 @@ def export_law(
         "num_coordinates": n,
         "num_inputs": safe.law.num_inputs,
         "memory_size": safe.memory_size,
-        **{key: getattr(safe.law, key).tolist() for key in ("position_gain", "velocity_gain")},
+        **{key: _listed(getattr(safe.law, key)) for key in ("position_gain", "velocity_gain")},
+        **({"dead_time": safe.latent.dead_time} if safe.latent else {}),
         **({"q": [*model.labels], "u": [*model.input_labels]} if model.labels else {}),
         **(about or {}),
     }
@@ -86,3 +89,7 @@ def export_law(
         text += f" q_ref, v_ref and a_ref are the reference {safe.compensation.ahead:g} s ahead."
     law = ExportedFunction("control", safe, inputs, ("u", "status", "memory_out"), text)
     return write([law], path, info, real)
+
+
+def _listed(gain: Tensor | float) -> float | list[float]:
+    return gain.tolist() if isinstance(gain, Tensor) else gain

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from typing import Annotated
 
@@ -13,13 +14,13 @@ from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.effects import Actuator
-from pinn_dyn.mechanics import InputSolver
+from pinn_dyn.exports.c_loop import rows_in_c
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import CoupledOscillators
-from pinn_dyn.models.oscillators import Linearization
 
 _PROCESS = 1e-3  # standard deviation of unknown inputs, in those of the data
-_TOLERANCE = 1e-5  # of q(u_d) at the first call
+_NEWTON_STEPS = 2  # per call, to z_d
+_ROUNDING = 1e-9  # of periods
 _RANK = 1e-3  # singular values below this share of the largest are zero
 
 
@@ -45,8 +46,8 @@ class LatentLaw(Controller):
     integral action: if the loop comes to rest, q = q_ref - d + d = q_ref, whatever the errors of
     the model. d does not wind up while the motors are at their limits, since the model knows u.
 
-    u_d takes one step of Newton's method per call, after all steps at the first call. With a dead
-    time, the feedback uses the state that the model predicts at its end.
+    u_d takes one step of Newton's method per call, from the mean input of the data, and z_d two.
+    With a dead time, the feedback uses the state that the model predicts at its end.
 
     Assumptions: the robot starts at rest with a known input; the loop is stable, which is not
     proven under sampling, dead time and errors of the model: simulate it.
@@ -87,18 +88,20 @@ class LatentLaw(Controller):
         self.position_gain, self.velocity_gain = float(position_gain), float(velocity_gain)
         self.integral_gain = float(integral_gain)
         self.actuator = actuator or Actuator()
-        limits = self.actuator.low, self.actuator.high
-        self._solver = InputSolver(tolerance=_TOLERANCE, low=limits[0], high=limits[1])
         self._first_input = torch.as_tensor(first_input, dtype=torch.float64)
         M, N = self.num_inputs, self.num_coordinates
         self._u_mean, self._u_std = model.mean[-M:], model.std[-M:]
         self._q_std, self._center = model.std[:N], model.linearize(model.mean[-M:])
+        self._first_target = model.rest(self.actuator.limit(self._u_mean))[0]
+        self.memory_size = 1 + 3 * len(model.bias) + N + M
+        self.prepare(model.fixed_step)
         self.reset()
 
     def reset(self) -> None:
-        self._time, self._period = math.nan, 0.0
-        self._past: list[Tensor] = []  # inputs, the latest last
+        self._time, self._is_second_call = math.nan, False
+        self._memory = self._u_mean.new_zeros(0, 0, 0, 0)
         self._residual: Tensor | None = None
+        self._past = self._first_input
 
     def observer_gain(self, period: PositiveFloat) -> tuple[Tensor, Tensor]:
         """Return L ``(2n + N, N)`` and the matrix of the error of (x, d) for a period in s."""
@@ -122,103 +125,156 @@ class LatentLaw(Controller):
         """Return the eigenvalues of the error of the observer over a period in s."""
         return np.linalg.eigvals(self.observer_gain(period)[1].numpy())
 
+    def prepare(self, period: PositiveFloat) -> None:
+        """Compute the constants of a period in s."""
+        self._period = period
+        self._gain, _ = self.observer_gain(period)
+        self._flow = self.model.flow(period / self.model.fixed_step)
+        self._wait = self.model.flow(self.dead_time / self.model.fixed_step)
+        self.stored_inputs = int(self.dead_time / period + _ROUNDING) + 2
+        gains = self.position_gain, self.velocity_gain, self.integral_gain, self.noise
+        settings = period, self.dead_time, gains, self.actuator, self._first_input.tolist()
+        self._name = hashlib.sha256(f"{settings}".encode()).hexdigest()
+
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
 
         Raises:
             ValueError: if the period changes.
         """
-        q_ref, v_ref = (x.expand_as(q) for x in reference[:2])
+        batch, M = q.shape[:-1], self.num_inputs
         with torch.no_grad():
-            if not self._past or self._past[-1].shape[:-1] != q.shape[:-1]:
-                self._start(q, v, q_ref)
+            is_first = self._memory.shape[:-1] != batch
+            if is_first:
+                self.reset()
+                self.prepare(self._period)
+                self._memory = q.new_zeros(*batch, self.memory_size)
+                self._past = self._first_input.expand(*batch, 1, M)
             else:
-                self._observe(t, q)
-            at = self._target(q_ref)
-            x = self._predicted()
-            u = self._u_d + self._u_std * self._feedback(at, x, v_ref)
-            u = self.actuator.limit(u, self._past[-1] if self._period else None, self._period)
-        self._time = t
-        self._past.append(u)
+                self._require_period(t - self._time)
+            lacking = max(self.stored_inputs - self._past.shape[-2], 0)
+            older = self._past[..., :1, :].expand(*batch, lacking, M)
+            past = torch.cat([older, self._past], dim=-2)[..., -self.stored_inputs :, :]
+            motion = (x.expand_as(q) for x in reference[:2])
+            rows = torch.cat([q, v, *motion, past.flatten(-2), self._memory], dim=-1)
+            result = rows_in_c(self.model, self._name, self._row, rows)(rows)
+            sizes = [M, self.memory_size, 1]
+            u, self._memory, residual = result.split(sizes, dim=-1)
+            last = None if is_first else past[..., -1, :]
+            u = self.actuator.limit(u, last, self._period)
+        self._past = torch.cat([past, u.unsqueeze(-2)], dim=-2)
+        self._time, self._residual = t, residual[..., 0]
+        self._is_second_call = is_first
         return u
 
-    def _start(self, q: Tensor, v: Tensor, q_ref: Tensor) -> None:
-        """Encode the first state, and find the input that holds the reference."""
-        model, n = self.model, self.model.past_steps
-        self.reset()
-        u = self._first_input.expand(*q.shape[:-1], self.num_inputs)
-        past = [x.repeat(*[1] * (x.ndim - 1), n) for x in (q, u)]
-        self._x = model.start(q, v, u, *past)[..., : 2 * len(model.bias)]
-        self._d = q - model.observe(self._x)
-        self._past = [u]
-        typical = self._u_mean.expand_as(u)
-        self._z_d: Tensor | None = None
-        self._u_d = self._solver(lambda u: model.rest(u)[1], q_ref - self._d, typical).u
+    def _require_period(self, period: float) -> None:
+        """Prepare the period at the second call, and refuse another one later."""
+        is_same = abs(period - self._period) <= 1e-6 * self._period
+        if not is_same and not self._is_second_call:
+            time = self._time + period
+            raise ValueError(f"the period of the law changed at {time:g} s: reset() the law before")
+        if not is_same:
+            self.prepare(float(f"{period:.9g}"))
 
-    def _observe(self, t: float, q: Tensor) -> None:
+    def _row(self, rows: Tensor) -> Tensor:
+        N, M = self.num_coordinates, self.num_inputs
+        stored = self.stored_inputs * M
+        sizes = [N, N, N, N, stored, self.memory_size]
+        q, v, q_ref, v_ref, past, memory = rows.split(sizes, dim=-1)
+        past = past.unflatten(-1, (-1, M))
+        return torch.cat(self.law_of(q, v, q_ref, v_ref, past, memory), dim=-1)
+
+    def law_of(
+        self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, past: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return u without limits, the memory after the call and the residual.
+
+        The operations do not depend on the numbers, so that the law has a file.
+
+        Args:
+            q, v, q_ref, v_ref: measurement and reference, ``(*batch, N)``.
+            past: last inputs, the latest last, ``(*batch, stored_inputs, M)``.
+            memory: ``(*batch, S)``, which is zero before the first call: 1, x, d, u_d and z_d.
+        """
+        n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
+        started, x, d, u_d, z_d = memory.split([1, 2 * n, N, M, n], dim=-1)
+        is_later = started > 0.5
+        past = self.past_of(past, memory)
+        first = self._first(q, v, self._first_input.expand(u_d.shape))
+        later = (*self._observed(q, x, d, past), u_d, z_d)
+        x, d, u_d, z_d = (torch.where(is_later, *y) for y in zip(later, first, strict=True))
+        at = self.model.linearize(u_d, z_d, _NEWTON_STEPS)
+        F = at.input * self._u_std
+        compliant = torch.cholesky_solve(F, torch.linalg.cholesky_ex(at.stiffness).L)
+        error = (q_ref - d - at.q) / self._q_std
+        J = at.output[..., : at.z.shape[-1]] / self._q_std[:, None] @ compliant
+        inverse = torch.linalg.pinv(J.mT @ J, rtol=_RANK**2, hermitian=True) @ J.mT
+        change = self._u_std * matvec(inverse, error).clamp(-1.0, 1.0)
+        u_d = self.actuator.limit(u_d + change)
+        rate_d = matvec(compliant @ inverse, v_ref / self._q_std)
+        slopes, wanted = (F, compliant), (at.z, rate_d, u_d)
+        u = u_d + self._u_std * self._feedback(self._predicted(x, past), is_later, *slopes, *wanted)
+        memory = torch.cat([torch.ones_like(started), x, d, u_d, at.z], dim=-1)
+        return u, memory, error.square().sum(-1, keepdim=True).sqrt()
+
+    def past_of(self, past: Tensor, memory: Tensor) -> Tensor:
+        """Return the last inputs, which are the first input before the first call."""
+        return torch.where(memory[..., :1, None] > 0.5, past, self._first_input.expand(past.shape))
+
+    def _first(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+        """Return x, d, u_d and z_d at rest with a known input."""
+        past = (x.repeat(*[1] * (x.ndim - 1), self.model.past_steps) for x in (q, u))
+        x = self.model.start(q, v, u, *past)[..., : 2 * len(self.model.bias)]
+        z_d = self._first_target.expand(*x.shape[:-1], -1)
+        return x, q - self.model.observe(x), self.actuator.limit(self._u_mean).expand_as(u), z_d
+
+    def _observed(self, q: Tensor, x: Tensor, d: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
         """Move the estimate by a period with the inputs that acted, after its correction."""
-        if not self._period:
-            self._period = t - self._time
-            self._gain, _ = self.observer_gain(self._period)
-            self._flow = self.model.flow(self._period / self.model.fixed_step)
-        if abs(t - self._time - self._period) > 1e-6 * self._period:
-            raise ValueError(f"the period of the law changed at {t:g} s: reset() the law before")
-        wait = self.dead_time / self._period
-        whole = int(wait + 1e-9)
-        share = wait - whole  # of the period, in which the older input acts
-        newer, older = (self._past[max(len(self._past) - 1 - k, 0)] for k in (whole, whole + 1))
-        del self._past[: -whole - 2]
-        self._x = self._moved(self._x, self._flow, newer.lerp(older, share))
-        error = (q - self.model.observe(self._x) - self._d) / self._q_std
-        change = error @ self._gain.mT
-        states = self._x.shape[-1]
-        self._x = self._x + change[..., :states]
-        self._d = self._d + self._q_std * change[..., states:]
+        whole = self.stored_inputs - 2
+        share = self.dead_time / self._period - whole  # of the period, for the older input
+        newer, older = past[..., -1 - whole, :], past[..., -2 - whole, :]
+        moved = self._moved(x, self._flow, newer.lerp(older, share))
+        error = (q - self.model.observe(moved) - d) / self._q_std
+        of_x, of_d = (error @ self._gain.mT).tensor_split([x.shape[-1]], dim=-1)
+        return moved + of_x, d + self._q_std * of_d
 
     def _moved(self, x: Tensor, flow: tuple[Tensor, Tensor], u: Tensor) -> Tensor:
         force = self.model.latent_force(u) - self.model.coupling_force(x[..., : x.shape[-1] // 2])
         return x @ flow[0].mT + force @ flow[1].mT
 
-    def _predicted(self) -> Tensor:
+    def _predicted(self, x: Tensor, past: Tensor) -> Tensor:
         """Return the state at the end of the dead time, under the mean input until then."""
-        if not self.dead_time or not self._period:
-            return self._x
-        waiting = math.ceil(self.dead_time / self._period - 1e-9)
-        u = torch.stack(self._past[-waiting:]).mean(0)
-        flow = self.model.flow(self.dead_time / self.model.fixed_step)
-        return self._moved(self._x, flow, u)
+        if not self.dead_time:
+            return x
+        waiting = math.ceil(self.dead_time / self._period - _ROUNDING)
+        return self._moved(x, self._wait, past[..., -waiting:, :].mean(-2))
 
-    def _target(self, q_ref: Tensor) -> Linearization:
-        """Take a step of Newton's method to the input that holds q_ref - d."""
-        at = self.model.linearize(self._u_d, self._z_d)
-        self._z_d = at.z
-        self._residual = torch.linalg.vector_norm((q_ref - self._d - at.q) / self._q_std, dim=-1)
-        step = matvec(self._inverse_gain(at), (q_ref - self._d - at.q) / self._q_std)
-        self._u_d = self.actuator.limit(self._u_d + self._u_std * step.clamp(-1.0, 1.0))
-        return at
+    def _feedback(
+        self,
+        x: Tensor,
+        is_later: Tensor,
+        F: Tensor,
+        compliant: Tensor,
+        z_d: Tensor,
+        rate_d: Tensor,
+        u_d: Tensor,
+    ) -> Tensor:
+        """Return (u - u_d) / S from the mean state of the coming period, which it changes.
 
-    def _inverse_gain(self, at: Linearization) -> Tensor:
-        """Return J^+ of the normalized q and u, ``(*batch, M, N)``."""
-        output = at.output[..., : at.z.shape[-1]] / self._q_std[:, None]
-        J = output @ torch.linalg.solve(at.stiffness, at.input * self._u_std)
-        return torch.linalg.pinv(J, rtol=_RANK)
-
-    def _feedback(self, at: Linearization, x: Tensor, v_ref: Tensor) -> Tensor:
-        """Return (u - u_d) / S from the mean state of the coming period, which it changes."""
-        F = at.input * self._u_std
-        compliant = torch.linalg.solve(at.stiffness, F)
+        At the first call, it takes the present state. ``compliant`` is H^-1 F.
+        """
         psi = torch.linalg.pinv(F.mT @ compliant, rtol=_RANK, hermitian=True) @ F.mT
         # Velocities and the velocity gain are those per step of the model.
         step = self.model.fixed_step
-        rate_d = step * matvec(compliant @ self._inverse_gain(at), v_ref / self._q_std)
-        (z, rate), ratio, effect = x.chunk(2, dim=-1), self._period / step, torch.zeros_like(F)
-        if ratio:
-            later = self._moved(x, self._flow, self._u_d)
-            rate = (later[..., : z.shape[-1]] - z) / ratio
-            effect = self._flow[1][: z.shape[-1]] @ F / ratio
+        z, rate = x.chunk(2, dim=-1)
+        later = self._moved(x, self._flow, u_d)[..., : z.shape[-1]]
+        rate = torch.where(is_later, (later - z) * step / self._period, rate)
+        ratio = self._period / step * is_later
         position, velocity = self.position_gain, self.velocity_gain / step
-        wanted = position * (at.z - z - ratio / 2 * rate) + velocity * (rate_d - rate)
-        change = (ratio / 2 * position + velocity) * psi @ effect
+        wanted = position * (z_d - z - ratio / 2 * rate) + velocity * (step * rate_d - rate)
+        effect = self._flow[1][: z.shape[-1]] @ F / (self._period / step)
+        change = (ratio.unsqueeze(-1) / 2 * position + velocity) * psi @ effect
+        change = is_later.unsqueeze(-1) * change
         one = torch.eye(self.num_inputs).to(change)
         return torch.linalg.solve(one + change, matvec(psi, wanted).unsqueeze(-1))[..., 0]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from pinn_dyn.control.adaptive import AdaptiveTracking
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.dead_time import DelayCompensation
 from pinn_dyn.control.effects import Actuator
+from pinn_dyn.control.latent_law import LatentLaw
 from pinn_dyn.control.laws import ModelBasedLaw
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.region import Guarded
@@ -33,11 +36,13 @@ class SafeLaw:
 
     The status is the sum of 1 (the actuator changed u), 2 (outside the training data) and 4 (not
     finite). The memory is zero before the first call. It holds the last u ``(M,)`` and the memory
-    of the observer, see :meth:`DisturbanceObserver.correct`, or of the adaptation.
+    of the observer, see :meth:`DisturbanceObserver.correct`, or of the adaptation. That of a
+    :class:`LatentLaw` holds its last inputs, as many as its dead time needs, and its own memory.
 
     Args:
-        controller: a law of a model, also with an observer, a guard or a DelayCompensation.
-        actuator: limits of the input.
+        controller: a law of a model, also with an observer, a guard or a DelayCompensation, or a
+            LatentLaw.
+        actuator: limits of the input; None takes those of a LatentLaw.
         period: time between two calls, s; limits of the rate and observers need it.
 
     Raises:
@@ -59,17 +64,26 @@ class SafeLaw:
         law = self.guard.law if self.guard else controller
         self.observer = law if isinstance(law, DisturbanceObserver) else None
         law = self.observer.law if self.observer else law
-        if not isinstance(law, ModelBasedLaw):
+        self.latent: LatentLaw | None = None
+        if isinstance(law, LatentLaw):
+            if period is None:
+                raise ValueError("a LatentLaw needs a fixed period: give a rate")
+            law = self.latent = copy.copy(law)
+            self.latent.prepare(period)
+            actuator = actuator or law.actuator
+        elif not isinstance(law, ModelBasedLaw):
             raise TypeError(
                 f"{type(law).__name__} cannot be exported, expected a law of a model such as "
-                "Tracking, also with a DisturbanceObserver or a guard"
+                "Tracking, also with a DisturbanceObserver or a guard, or LatentLaw"
             )
         self.law, self.actuator = law, actuator or Actuator()
         if period is None and (self.observer or self.actuator.rate is not None):
             raise ValueError("an observer or a limited rate needs a fixed period: give a rate")
         self.period = period
         self.stored_inputs = law.num_inputs * (self.compensation.size if self.compensation else 1)
-        self.memory_size = self.stored_inputs
+        if self.latent:
+            self.stored_inputs = self.latent.stored_inputs * law.num_inputs
+        self.memory_size = self.stored_inputs + (self.latent.memory_size if self.latent else 0)
         if self.observer:
             self.memory_size += self.observer.memory_size
         self.adaptive = law if isinstance(law, AdaptiveTracking) else None
@@ -94,7 +108,12 @@ class SafeLaw:
         if self.adaptive:
             u = self.adaptive.law_of(q, v, reference, memory)
             changes = self.adaptive.changes(q, v, reference, memory)
+        elif self.latent:
+            past = self.latent.past_of(past, memory)
+            last = past[-1]
+            u, after, _ = self.latent.law_of(q, v, q_ref, v_ref, past, memory)
         else:
+            assert isinstance(self.law, ModelBasedLaw)
             u = self.law.law(q, v, *reference, last)
         if self.observer:
             u, finish = self.observer.correct(q, v, u, last, memory, self.period or 0.0)
@@ -108,13 +127,15 @@ class SafeLaw:
         u = torch.where(finite, u, last)
         applied = self.actuator.limit(u, last, self.period or 0.0)
         status = status + LIMITED * ((applied != u).to(u).sum() > 0)
-        if self.observer or self.adaptive:
+        if self.observer or self.adaptive or self.latent:
             if self.adaptive:
                 after = self.adaptive.adapted(memory, changes, self.period or 0.0)
-            else:
+            elif self.observer:
                 after = finish(applied)
             memory = torch.where(finite & (after.abs().sum() < torch.inf), after, memory)
         output, stored = applied, applied
         if self.compensation:
             output, stored = self.compensation.applied(past, applied)
+        if self.latent:
+            stored = torch.cat([past[1:], applied[None]])
         return output, status, torch.cat([stored.flatten(), memory])

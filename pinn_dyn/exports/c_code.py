@@ -125,10 +125,11 @@ class _Buffers:
         self._free: list[str] = []
 
     def take(self, kind: str, size: int) -> str:
-        for name in self._free:
-            if self.sizes[name] == (kind, size):
-                self._free.remove(name)
-                return name
+        fitting = [x for x in self._free if self.sizes[x] >= (kind, size) and kind in self.sizes[x]]
+        if fitting:
+            name = min(fitting, key=self.sizes.__getitem__)
+            self._free.remove(name)
+            return name
         name = f"x{len(self.sizes)}"
         self.sizes[name] = kind, size
         return name

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+
+_SWEEPS = 6  # of Jacobi rotations
 
 
 def cholesky(matrix: Tensor) -> Tensor:
@@ -14,11 +17,10 @@ def cholesky(matrix: Tensor) -> Tensor:
     columns: list[Tensor] = []
     size = matrix.shape[-1]
     for j in range(size):
-        column = matrix[..., j:, j]
-        for previous in columns:
-            column = column - previous[..., j:] * previous[..., j : j + 1]
-        column = column / column[..., :1].sqrt()
+        column = matrix[..., 0] / matrix[..., :1, 0].sqrt()
         columns.append(torch.nn.functional.pad(column, (j, 0)))
+        below = column[..., 1:]
+        matrix = matrix[..., 1:, 1:] - below.unsqueeze(-1) * below.unsqueeze(-2)
     return torch.stack(columns, dim=-1)
 
 
@@ -27,10 +29,10 @@ def solve_triangular(matrix: Tensor, right: Tensor, upper: bool) -> Tensor:
     size = matrix.shape[-1]
     rows: dict[int, Tensor] = {}
     for i in reversed(range(size)) if upper else range(size):
-        row = right[..., i, :]
-        for j, solved in rows.items():
-            row = row - matrix[..., i, j : j + 1] * solved
-        rows[i] = row / matrix[..., i, i : i + 1]
+        rows[i] = right[..., -1 if upper else 0, :] / matrix[..., i, i : i + 1]
+        others = slice(0, i) if upper else slice(i + 1, size)
+        of_others = right[..., :-1, :] if upper else right[..., 1:, :]
+        right = of_others - matrix[..., others, i : i + 1] * rows[i].unsqueeze(-2)
     return torch.stack([rows[i] for i in range(size)], dim=-2)
 
 
@@ -52,6 +54,38 @@ def qr(matrix: Tensor) -> tuple[Tensor, Tensor]:
     for w, scale in reversed(reflections):
         Q = Q - (scale * w).unsqueeze(-1) * (w.unsqueeze(-1) * Q).sum(-2, keepdim=True)
     return Q, R[..., :columns, :].triu()
+
+
+def symmetric_eigenvectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the eigenvalues ``(*batch, n)``, in no order, and eigenvectors in columns.
+
+    Six sweeps of Jacobi rotations suffice for small matrices.
+    """
+    size = matrix.shape[-1]
+    one = torch.eye(size, dtype=matrix.dtype)
+    vectors = one.expand(matrix.shape)
+    for i, j in [*itertools.combinations(range(size), 2)] * _SWEEPS:
+        difference = matrix[..., j, j] - matrix[..., i, i]
+        entry = 2 * matrix[..., i, j]
+        length = (difference * difference + entry * entry).sqrt()
+        total = difference + torch.where(difference < 0, -length, length)
+        tangent = torch.where(total == 0, 0.0, entry / torch.where(total == 0, 1.0, total))
+        cosine = 1 / (1 + tangent * tangent).sqrt()
+        plane, turned = one[i].diag() + one[j].diag(), one[i].outer(one[j]) - one[j].outer(one[i])
+        cosine, sine = cosine[..., None, None], (tangent * cosine)[..., None, None]
+        rotation = one + (cosine - 1) * plane + sine * turned
+        matrix, vectors = rotation.mT @ matrix @ rotation, vectors @ rotation
+    return matrix.diagonal(dim1=-2, dim2=-1), vectors
+
+
+def _pinv(A: Tensor, *, atol: Any = None, rtol: Any = None, hermitian: bool = False) -> Any:
+    if not hermitian or rtol is None:
+        return NotImplemented
+    values, vectors = symmetric_eigenvectors(A)
+    size = values.abs()
+    is_zero = size <= rtol * size.amax(-1, keepdim=True)
+    inverse = torch.where(is_zero, 0.0, 1 / torch.where(is_zero, 1.0, values))
+    return (vectors * inverse.unsqueeze(-2)) @ vectors.mT
 
 
 def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = False) -> Any:
@@ -126,6 +160,7 @@ DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     _aten.bmm.default: lambda a, b: (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2),
     _aten.linalg_inv_ex.default: _inverse_ex,
     _aten.linalg_qr.default: lambda A, mode="reduced": qr(A),
+    _aten.linalg_pinv.atol_rtol_tensor: _pinv,
     _aten.linalg_solve_triangular.default: _solve_triangular,
     _aten.add.Tensor: _scaled(torch.add),
     _aten.sub.Tensor: _scaled(torch.sub),

@@ -12,6 +12,7 @@ from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics import double_copy
+from pinn_dyn.mechanics.arrays import spd_solve
 from pinn_dyn.models.initial_velocity import InitialVelocityHead
 from pinn_dyn.models.mlp import Activation
 from pinn_dyn.models.modes import Modes, modes_of
@@ -216,11 +217,14 @@ class CoupledOscillators(EncodedPredictor):
         slope = 1 - torch.tanh(F.linear(z, self.coupling, self.bias)).square()
         return self.matrices()[0] + self.coupling.T @ (slope.unsqueeze(-1) * self.coupling)
 
-    def equilibrium(self, force: Tensor, start: Tensor | None = None) -> Tensor:
+    def equilibrium(
+        self, force: Tensor, start: Tensor | None = None, steps: int | None = None
+    ) -> Tensor:
         """Return z with K z + W^T tanh(W z + b) = force, ``(*batch, n)``, in float64.
 
         Newton's method minimizes the convex function V(z) - z^T force. A step is halved until its
-        end has the slope of a descent.
+        end has the slope of a descent. With a number of ``steps``, the operations do not depend on
+        the numbers, and the result is not tested.
 
         Raises:
             RuntimeError: if it does not converge.
@@ -228,11 +232,11 @@ class CoupledOscillators(EncodedPredictor):
         K, _ = self.matrices()
         bound = K + self.coupling.T @ self.coupling
         z = torch.linalg.solve(bound, force.unsqueeze(-1))[..., 0] if start is None else start
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(steps or _NEWTON_STEPS):
             slope = F.linear(z, K) + self.coupling_force(z) - force
-            step = torch.linalg.solve(self.stiffness_at(z), slope.unsqueeze(-1))[..., 0]
+            step = spd_solve(self.stiffness_at(z), slope)
             # NaN is returned.
-            if not bool((slope.norm(dim=-1) > 1e-9 * (1 + force.norm(dim=-1))).any()):
+            if not steps and not bool((slope.norm(dim=-1) > 1e-9 * (1 + force.norm(dim=-1))).any()):
                 return z - step  # with the derivative of z
             length = torch.ones_like(z[..., :1])
             for _ in range(_HALVINGS):
@@ -243,19 +247,24 @@ class CoupledOscillators(EncodedPredictor):
                 )
                 length = torch.where(beyond, length / 2, length)
             z = z - length * step
+        if steps:
+            return z
         raise RuntimeError(f"no equilibrium was found within {_NEWTON_STEPS} steps of Newton")
 
-    def rest(self, u: Tensor, start: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def rest(
+        self, u: Tensor, start: Tensor | None = None, steps: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return z and q of the equilibrium under a constant u, ``(*batch, n or N)``, in float64.
 
         Args:
             u: input, ``(*batch, M)``.
             start: z to start from, such as that of a similar input.
+            steps: number of steps of Newton's method, see :meth:`equilibrium`.
 
         Raises:
             RuntimeError: see :meth:`equilibrium`.
         """
-        z = self.equilibrium(self.latent_force(u), start)
+        z = self.equilibrium(self.latent_force(u), start, steps)
         return z, self.observe(torch.cat([z, torch.zeros_like(z)], dim=-1))
 
     def observe(self, x: Tensor) -> Tensor:
@@ -263,9 +272,11 @@ class CoupledOscillators(EncodedPredictor):
         size = self.num_coordinates
         return self.mean[:size] + self.std[:size] * self.output(x)[..., :size]
 
-    def linearize(self, u: Tensor, start: Tensor | None = None) -> Linearization:
+    def linearize(
+        self, u: Tensor, start: Tensor | None = None, steps: int | None = None
+    ) -> Linearization:
         """Return the slopes of the model at its equilibrium, see :meth:`rest`."""
-        z, q = self.rest(u, start)
+        z, q = self.rest(u, start, steps)
         x = torch.cat([z, torch.zeros_like(z)], dim=-1)
         slopes = _slopes(self.latent_force, u), _slopes(self.observe, x)
         return Linearization(z, q, self.stiffness_at(z), *slopes)

@@ -2,14 +2,18 @@
 
 import copy
 
+import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.control import Actuator, LatentLaw, MotorPID, SetPoint, close_loop
+from pinn_dyn.control import Actuator, LatentLaw, MotorPID, SetPoint, close_loop, export_law
 from pinn_dyn.control.contracts import Motion, Plant, Reference
+from pinn_dyn.control.safe_law import SafeLaw
+from pinn_dyn.exports import c_loop
 from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.testing import LinearSystem, damped_oscillators
 from tests.models.builders import STEP, make_statistics
+from tests.support.c_code import function_of
 
 
 def make_oscillators(output):
@@ -97,8 +101,8 @@ def test_the_steady_state_error_vanishes_with_a_wrong_model(model, periods, shar
     law = LatentLaw(model, 0.5, 0.5 * STEP, 0.2 / STEP, dead_time=periods * period, noise=0.01)
     found, steps = errors(model, law, delay=periods, rate=1 / period)
     assert (found[:, -1] < 1e-3 * steps).all()
-    wrong = model.rest(law._u_d)[1] + law._d
-    assert (wrong - model.rest(law._u_d)[1]).norm() > 0.01 * steps.min()  # the model was wrong
+    disturbance = law._memory[:, 1 + 2 * len(model.bias) :][:, :2]
+    assert disturbance.norm() > 0.01 * steps.min()  # the model was wrong
 
 
 def test_the_steady_state_error_vanishes_in_measured_coordinates():
@@ -119,14 +123,15 @@ def test_no_gain_and_no_rate_is_too_large_for_the_model(model, gain, share):
     F = at.input * model.std[-2:]
     compliant = torch.linalg.solve(at.stiffness, F)
     spring = gain * F @ torch.linalg.solve(F.T @ compliant, F.T)
-    law._u_d, law._period, law._flow = u[None], share * STEP, model.flow(ratio)
+    law.prepare(share * STEP)
+    known = torch.ones(1, 1).bool(), F, compliant, at.z, torch.zeros(1, n).double(), u[None]
     x = 1e-5 * torch.randn(1, 2 * n, generator=torch.manual_seed(0)).double()
     rest = torch.cat([at.z, torch.zeros_like(at.z)])
     energies = []
     for _ in range(50):
         z, v = x[0].chunk(2)
         energies.append(z @ (at.stiffness + spring) @ z + v @ v)
-        feedback = law._feedback(model.linearize(u[None]), rest + x, torch.zeros(1, 2).double())
+        feedback = law._feedback(rest + x, *known)
         x = x @ A.T + (feedback * model.std[-2:]) @ B.T
     energies = torch.stack(energies)
     # Up to what the linearization of the step leaves.
@@ -199,6 +204,41 @@ def test_the_law_keeps_the_limits_without_winding_up(model):
     assert ((u > low - 1e-6) & (u < high + 1e-6)).all()
     assert at_limits[:20].any()
     assert not at_limits[-1].any()
+
+
+@pytest.mark.usefixtures("few_states")
+def test_the_file_in_c_gives_the_inputs_of_the_loop(model, tmp_path, monkeypatch):
+    """A closed loop with a wrong model, limits and a dead time; and rows in C in the loop."""
+    low, high = ((model.mean[-2:] + s * model.std[-2:]).tolist() for s in (-0.4, 0.5))
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
+    monkeypatch.setattr(c_loop, "STEPS", 5)
+    monkeypatch.setattr(c_loop, "_ROWS", {})
+    law = LatentLaw(
+        *(model, 0.5, 0.5 * STEP, 0.2 / STEP),
+        dead_time=1.5 * STEP,
+        first_input=[0.1, -0.1],
+        actuator=Actuator(low, high, 2.0 / STEP),
+    )
+    path = export_law(law, tmp_path / "law.c", period=STEP)
+    call, size = function_of(path, "law_control"), SafeLaw(law, None, STEP).memory_size
+    plant, zero = Oscillators(model), torch.zeros(1, 2).double()
+    target = plant.model.rest(model.mean[-2:] + 0.3 * model.std[-2:])[1]
+    q, memory, statuses = plant.model.rest(zero)[1], np.zeros(size), set()
+    plant.start(q, zero)
+    for k in range(40):
+        motion = Motion(target, 0 * target, 0 * target)
+        u = law(k * STEP, q, zero, motion)
+        found, memory, status = call(*(x.numpy() for x in (q[0], zero[0], *motion)), memory)
+        np.testing.assert_allclose(found, u[0], rtol=1e-9, atol=1e-9)
+        statuses.add(status)
+        q, _ = plant.advance(u, STEP)
+    assert statuses == {0, 1}
+    assert len(c_loop._ROWS) == 1
+    assert law._row not in c_loop._ROWS.values()
+    u, after, status = call(*(x.numpy() for x in (torch.nan * q[0], zero[0], *motion)), memory)
+    np.testing.assert_array_equal(u, found)
+    np.testing.assert_array_equal(after[-law.memory_size :], memory[-law.memory_size :])
+    assert status == 4
 
 
 def test_the_law_refuses_other_models():
