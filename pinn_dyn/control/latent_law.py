@@ -208,7 +208,7 @@ class LatentLaw(Controller):
         compliant = torch.cholesky_solve(F, torch.linalg.cholesky_ex(at.stiffness).L)
         error = (q_ref - d - at.q) / self._q_std
         J = at.output[..., : at.z.shape[-1]] / self._q_std[:, None] @ compliant
-        inverse = torch.linalg.pinv(J.mT @ J, rtol=_RANK**2, hermitian=True) @ J.mT
+        inverse = torch.linalg.pinv(J, rtol=_RANK)
         change = self._u_std * matvec(inverse, error).clamp(-1.0, 1.0)
         u_d = self.actuator.limit(u_d + change)
         rate_d = matvec(compliant @ inverse, v_ref / self._q_std)
@@ -269,7 +269,7 @@ class LatentLaw(Controller):
         z, rate = x.chunk(2, dim=-1)
         later = self._moved(x, self._flow, u_d)[..., : z.shape[-1]]
         rate = torch.where(is_later, (later - z) * step / self._period, rate)
-        ratio = self._period / step * is_later
+        ratio = self._period / step * is_later.to(x)  # not of the default dtype
         position, velocity = self.position_gain, self.velocity_gain / step
         wanted = position * (z_d - z - ratio / 2 * rate) + velocity * (step * rate_d - rate)
         effect = self._flow[1][: z.shape[-1]] @ F / (self._period / step)

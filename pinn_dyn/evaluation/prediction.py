@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.exports.c_loop import CLoop
+from pinn_dyn.exports.latent_loop import LatentLoop
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
     MechanicalSystem,
@@ -23,6 +24,7 @@ from pinn_dyn.mechanics import (
     samples_of,
 )
 from pinn_dyn.mechanics.compilation import RecordedSteps
+from pinn_dyn.models.subspace_encoder import EncodedPredictor
 
 Model = TypeVar("Model", bound=Predictor)
 
@@ -133,6 +135,8 @@ def model_for_rollouts(
         inner.integrator = RecordedSteps(inner.integrator)
     elif isinstance(inner, ContinuousPredictor):
         inner.integrator = CLoop(inner.integrator, members, threads)
+    elif isinstance(inner, EncodedPredictor) and torch.device(device).type == "cpu":
+        LatentLoop(inner, threads).install()
     return copy
 
 

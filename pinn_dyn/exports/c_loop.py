@@ -73,7 +73,7 @@ class CLoop(Wrapped):
         It stays the loop of the present numbers of the model.
         """
         u = x.new_zeros(len(self.nodes), 1, dynamics.num_inputs)
-        return _loop_of(dynamics, self, x, u, x.new_tensor([0.0, h]))
+        return loop_of(dynamics, self, x, u, x.new_tensor([0.0, h]))
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         if not start.numel():
@@ -83,7 +83,7 @@ class CLoop(Wrapped):
         u = signal.u[..., 0, :].reshape(*leading, len(x), -1)[..., :1, :].movedim(-2, 0)
         u = u.expand(len(self.nodes), *u.shape).contiguous()
         fits = start.dtype == torch.float64 and start.is_cpu and not torch.is_grad_enabled()
-        loop = _loop_of(dynamics, self, x, u, grid) if fits else None
+        loop = loop_of(cast(nn.Module, dynamics), self, x, u, grid) if fits else None
         if loop is None:
             return self.inner.path(dynamics, start, grid, signal)
         blocks = [torch.zeros_like(x)[:, None]]
@@ -148,7 +148,7 @@ def traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> dict[str, Pro
     """Return the programs of a step of a model, and of the part that it calls."""
     step = {"increment": torch.zeros_like(x), "start": x, "inputs": inputs, "h": h}
     end = functools.partial(trace, dynamics.integration_step, step, ["end"], lines=False)
-    if x.ndim > 1:  # an ensemble
+    if x.ndim > 1 or not isinstance(dynamics, ContinuousPredictor):  # an ensemble, or no stages
         return {"integration_step": end()}
     with calling_part(dynamics, x, inputs[0]) as part:
         return {"part": part, "integration_step": end()}
@@ -282,12 +282,26 @@ _EXPECTED = SimpleNamespace(count=0)
 """Number of calls of each function of rows that will follow, 0 if unknown."""
 
 
-def _loop_of(
-    dynamics: Dynamics, integrator: CLoop, x: Tensor, u: Tensor, grid: Tensor
+def loop_of(
+    dynamics: nn.Module,
+    integrator: CLoop | None,
+    x: Tensor,
+    u: Tensor,
+    grid: Tensor,
+    *,
+    share: float = 1.0,
 ) -> Loop | None:
-    """Return the loop of a model, or None where it does not pay off yet or is not possible."""
+    """Return the loop of a model, or None where it does not pay off yet or is not possible.
+
+    Args:
+        dynamics: the model, with an ``integration_step``.
+        integrator: its integrator, if any.
+        x, u: states ``(B, S)`` and inputs of the first step ``(stages, B, M)``.
+        grid: times of the path.
+        share: time of a step in Python, in that of a step of a mechanical system.
+    """
     try:
-        model = _key_of(cast(nn.Module, dynamics), integrator)
+        model = _key_of(dynamics, integrator)
     except Exception:  # from a class that cannot be pickled, or without a file
         log.debug("no loop in C for %s", type(dynamics).__name__, exc_info=True)
         return None
@@ -297,7 +311,7 @@ def _loop_of(
         steps = (len(grid) - 1) * (1 + len(x) // TRAJECTORIES)
         is_new, _WITHOUT[key] = key not in _WITHOUT, _WITHOUT[key] + steps
         known = recall(key) if is_new else None
-        if (known is None and _WITHOUT[key] < STEPS) or find_compiler() is None:
+        if (known is None and share * _WITHOUT[key] < STEPS) or find_compiler() is None:
             return None
         if len(_LOOPS) >= _MOST_LOOPS:
             _LOOPS.clear()

@@ -56,36 +56,36 @@ def qr(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return Q, R[..., :columns, :].triu()
 
 
-def symmetric_eigenvectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the eigenvalues ``(*batch, n)``, in no order, and eigenvectors in columns.
+def pseudo_inverse(matrix: Tensor, rtol: Any) -> Tensor:
+    """Return the inverse ``(*batch, k, n)`` of a small matrix without the smallest singular values.
 
-    Six sweeps of Jacobi rotations suffice for small matrices.
+    Six sweeps of Jacobi rotations make its columns orthogonal. Singular values up to ``rtol`` times
+    the largest are zero.
+
+    Source: Hestenes 1958, "Inversion of matrices by biorthogonalization and related results".
     """
     size = matrix.shape[-1]
     one = torch.eye(size, dtype=matrix.dtype)
-    vectors = one.expand(matrix.shape)
+    vectors = one
     for i, j in [*itertools.combinations(range(size), 2)] * _SWEEPS:
-        difference = matrix[..., j, j] - matrix[..., i, i]
-        entry = 2 * matrix[..., i, j]
-        length = (difference * difference + entry * entry).sqrt()
+        a, b = matrix[..., i], matrix[..., j]
+        difference, product = ((b - a) * (b + a)).sum(-1), 2 * (a * b).sum(-1)
+        length = (difference * difference + product * product).sqrt()
         total = difference + torch.where(difference < 0, -length, length)
-        tangent = torch.where(total == 0, 0.0, entry / torch.where(total == 0, 1.0, total))
+        tangent = torch.where(total == 0, 0.0, product / torch.where(total == 0, 1.0, total))
         cosine = 1 / (1 + tangent * tangent).sqrt()
-        plane, turned = one[i].diag() + one[j].diag(), one[i].outer(one[j]) - one[j].outer(one[i])
+        plane, turn = one[i].diag() + one[j].diag(), one[i].outer(one[j]) - one[j].outer(one[i])
         cosine, sine = cosine[..., None, None], (tangent * cosine)[..., None, None]
-        rotation = one + (cosine - 1) * plane + sine * turned
-        matrix, vectors = rotation.mT @ matrix @ rotation, vectors @ rotation
-    return matrix.diagonal(dim1=-2, dim2=-1), vectors
+        rotation = one + (cosine - 1) * plane + sine * turn
+        matrix, vectors = matrix @ rotation, vectors @ rotation
+    squares = (matrix * matrix).sum(-2, keepdim=True)
+    is_zero = squares <= rtol * rtol * squares.amax(-1, keepdim=True)
+    inverse = torch.where(is_zero, 0.0, 1 / torch.where(is_zero, 1.0, squares))
+    return (vectors * inverse) @ matrix.mT
 
 
 def _pinv(A: Tensor, *, atol: Any = None, rtol: Any = None, hermitian: bool = False) -> Any:
-    if not hermitian or rtol is None:
-        return NotImplemented
-    values, vectors = symmetric_eigenvectors(A)
-    size = values.abs()
-    is_zero = size <= rtol * size.amax(-1, keepdim=True)
-    inverse = torch.where(is_zero, 0.0, 1 / torch.where(is_zero, 1.0, values))
-    return (vectors * inverse.unsqueeze(-2)) @ vectors.mT
+    return NotImplemented if rtol is None else pseudo_inverse(A, rtol)
 
 
 def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = False) -> Any:

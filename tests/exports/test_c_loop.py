@@ -84,6 +84,22 @@ def test_the_loop_gives_the_states_of_the_model(kind, batch):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("kind", "batch"), [("oscillators", ()), ("oscillators", (2, 3)), ("subnet", ())]
+)
+def test_the_loop_of_a_latent_state_gives_the_states_of_the_model(kind, batch):
+    model = make_model(kind).eval().requires_grad_(False)
+    generator, n, count = torch.Generator().manual_seed(0), model.num_coordinates, 200
+    x0 = 0.3 * torch.randn(*batch, 2 * n, generator=generator).double()
+    u = torch.randn(*batch, count, model.num_inputs, generator=generator).double()
+    t = model.fixed_step * torch.arange(count).double()
+    with torch.no_grad():
+        found = model_for_rollouts(model, threads=2).predict(x0, t, Signal(t, u))
+        expected = model.predict(x0, t, Signal(t, u))
+    assert next(iter(c_loop._LOOPS.values())) is not None
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
 def test_trajectories_side_by_side_do_not_mix_and_threads_share_them(monkeypatch):
     """Neither the lane, nor the thread, nor a neighbor that diverges changes a trajectory."""
     model = LinearSystem([[1.0]], [[-16.0]], [[0.0]], [[1.0]]).double()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pinn_dyn.control import ComputedTorque
-from pinn_dyn.exports.decompositions import cholesky, qr, solve_triangular
+from pinn_dyn.exports.decompositions import cholesky, pseudo_inverse, qr, solve_triangular
 from pinn_dyn.exports.program import trace
 from pinn_dyn.systems import SoftArm
 from tests.models.builders import VARIANTS, make_structured, random_batch
@@ -46,3 +46,15 @@ def test_the_factorizations_repeat_lapack(size):
 
 def test_a_matrix_without_a_cholesky_factor_gives_nan():
     assert cholesky(torch.tensor([[1.0, 2.0], [2.0, 1.0]])).isnan().any()
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (2, 5)])
+def test_the_pseudo_inverse_repeats_lapack_also_without_full_rank(shape):
+    generator = torch.Generator().manual_seed(0)
+    A = torch.randn(3, *shape, generator=generator, dtype=torch.float64)
+    A[0, :, -1] = A[0, :, 0] * (1 + 1e-6)
+    A[1] = 0
+    expected = torch.linalg.pinv(A, rtol=1e-3)
+    torch.testing.assert_close(pseudo_inverse(A, 1e-3), expected, rtol=0, atol=1e-12)
+    program = trace(lambda x: torch.linalg.pinv(x, rtol=1e-3), {"x": A[2]}, ["y"])
+    torch.testing.assert_close(program(A[0])[0], expected[0], rtol=0, atol=1e-12)
