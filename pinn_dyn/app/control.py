@@ -22,6 +22,7 @@ from pinn_dyn.control import (
     DisturbanceObserver,
     Guarded,
     LatentLaw,
+    LatentPlan,
     MotorPID,
     Reference,
     export_law,
@@ -163,6 +164,9 @@ def _law(
 ) -> Controller:
     """Build a law with its observer, guard and compensation of the delay, for loop and export."""
     law = build_law(config, name, learned, truth)
+    if isinstance(law, LatentPlan):
+        law.law.dead_time = float(np.max(run.input_delay, initial=0.0))
+        return law
     if isinstance(law, LatentLaw):
         if config["guard"].get("threshold") is not None:
             raise ConfigError("guard: a law on oscillators has no guard: leave the key out")

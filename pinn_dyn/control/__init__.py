@@ -9,6 +9,7 @@ from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.export import export_law
 from pinn_dyn.control.helix import Helix
 from pinn_dyn.control.latent_law import LatentLaw
+from pinn_dyn.control.latent_plan import LatentPlan
 from pinn_dyn.control.laws import (
     ComputedTorque,
     ModelBasedLaw,
@@ -39,6 +40,7 @@ __all__ = [
     "Guarded",
     "Helix",
     "LatentLaw",
+    "LatentPlan",
     "ModelBasedLaw",
     "Motion",
     "MotorPID",

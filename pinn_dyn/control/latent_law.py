@@ -167,6 +167,17 @@ class LatentLaw(Controller):
         self._is_second_call = is_first
         return u
 
+    def goal(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return x at the end of the dead time, u_d and z_d of the latest call."""
+        n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
+        _, x, _, u_d, z_d = self._memory.split([1, 2 * n, N, M, n], dim=-1)
+        with torch.no_grad():
+            return self._predicted(x, self._past[..., :-1, :]), u_d, z_d
+
+    def replace_input(self, u: Tensor) -> None:
+        """Store the input u ``(*batch, M)`` that acts instead of that of the latest call."""
+        self._past = torch.cat([self._past[..., :-1, :], u.unsqueeze(-2)], dim=-2)
+
     def _require_period(self, period: float) -> None:
         """Prepare the period at the second call, and refuse another one later."""
         is_same = abs(period - self._period) <= 1e-6 * self._period

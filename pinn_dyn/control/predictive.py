@@ -100,10 +100,6 @@ class PredictiveControl(Controller):
         actuator = actuator or Actuator()
         largest = model.largest_input()
         most = np.full(m, np.inf) if largest is None else largest.detach().numpy()
-        x_weight = [
-            _row("position_weight", position_weight, n),
-            _row("velocity_weight", velocity_weight, n),
-        ]
         v_high = _row("v_max", v_max, n, np.inf)
         low, high = _row("q_low", q_low, n, -np.inf), _row("q_high", q_high, n, np.inf)
         if (low > high).any():
@@ -117,7 +113,7 @@ class PredictiveControl(Controller):
             _row("actuator.rate", actuator.rate, m, np.inf),
         )
         self.weights = Weights(
-            np.concatenate(x_weight),
+            self._state_weight(position_weight, velocity_weight),
             _row("input_weight", input_weight, m),
             _row("rate_weight", rate_weight, m),
             _LIMIT_WEIGHT,
@@ -127,6 +123,12 @@ class PredictiveControl(Controller):
         self._bandwidth = observer_bandwidth
         self._reference: Reference | None = None
         self.reset()
+
+    def _state_weight(self, position: _Weight, velocity: _Weight) -> np.ndarray:
+        """Return the factor of Q, see :class:`~.shooting.Weights`."""
+        rows = (("position_weight", position), ("velocity_weight", velocity))
+        values = [_row(name, value, self.num_coordinates) for name, value in rows]
+        return np.diag(np.sqrt(np.concatenate(values)))
 
     def reset(self) -> None:
         self._memory: list[_Memory] = []
@@ -224,18 +226,22 @@ class PredictiveControl(Controller):
         last = self._references
         if last is not None and np.array_equal(last[0], x_ref):
             return last
-        u = np.zeros((count, problem.steps + 1, self.num_inputs))
-        if self.model.input_affine:
-            with torch.no_grad():
-                A = self.model.input_matrix(q)
-                u = pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a)).numpy()
-        u = u.clip(self.limits.u_low, self.limits.u_high)
+        u = self._feedforward(q, v, a).clip(self.limits.u_low, self.limits.u_high)
         if self._terminal is None:
             P = np.stack([problem.terminal_weight(x[k, -1], u[k, -1]) for k in range(count)])
         else:
-            P = np.broadcast_to(np.diag(self._terminal * self.weights.state), (count, 2 * n, 2 * n))
+            Q = self.weights.state.T @ self.weights.state
+            P = np.broadcast_to(self._terminal * Q, (count, 2 * n, 2 * n))
         self._references = x_ref, u[:, :-1].transpose(0, 2, 1), P
         return self._references
+
+    def _feedforward(self, q: Tensor, v: Tensor, a: Tensor) -> np.ndarray:
+        """Return u_ref without limits at the reference ``(K, S + 1, N)``, ``(K, S + 1, M)``."""
+        if not self.model.input_affine:
+            return np.zeros((*q.shape[:-1], self.num_inputs))
+        with torch.no_grad():
+            A = self.model.input_matrix(q)
+            return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a)).numpy()
 
     def _advance(
         self, k: int, t: float, x: np.ndarray, x_ref: np.ndarray, u_ref: np.ndarray, P: np.ndarray

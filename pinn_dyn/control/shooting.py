@@ -19,7 +19,7 @@ _CONVERGED = 1e-4  # largest change of a number in the last iteration, relative
 
 
 class Weights(NamedTuple):
-    """Diagonals Q ``(2N,)``, R and S ``(M,)`` of the cost, and rho of the state limits."""
+    """Factor E ``(rows, 2N)`` of Q = E^T E, diagonals R and S ``(M,)``, and rho of the limits."""
 
     state: np.ndarray
     input: np.ndarray
@@ -103,7 +103,8 @@ class ShootingProblem:
         arguments = [w, x0, u0, d, x_ref, u_ref, P]
 
         error, change = X - x_ref, U - ca.horzcat(u0, U[:, :-1])
-        Q, R, S = (ca.diag(ca.DM(np.sqrt(x))) for x in weights[:3])
+        R, S = (ca.diag(ca.DM(np.sqrt(x))) for x in weights[1:3])
+        Q = ca.sparsify(ca.DM(weights.state))
         cost = (
             h * ca.sumsqr(ca.mtimes(Q, error[:, :-1])) / 2
             + h * ca.sumsqr(ca.mtimes(R, U - u_ref)) / 2
@@ -160,7 +161,7 @@ class ShootingProblem:
         left = np.eye(2 * n) - h / 2 * A
         A, B = np.linalg.solve(left, np.eye(2 * n) + h / 2 * A), np.linalg.solve(left, h * B)
         try:
-            Q, R = h * np.diag(self.weights.state), h * np.diag(self.weights.input)
+            Q, R = h * self.weights.state.T @ self.weights.state, h * np.diag(self.weights.input)
             return scipy.linalg.solve_discrete_are(A, B, Q, R)
         except np.linalg.LinAlgError as error:
             raise ValueError(

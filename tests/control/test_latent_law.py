@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.control import Actuator, LatentLaw, MotorPID, SetPoint, close_loop, export_law
+from pinn_dyn.control import (
+    Actuator,
+    LatentLaw,
+    LatentPlan,
+    MotorPID,
+    SetPoint,
+    close_loop,
+    export_law,
+)
 from pinn_dyn.control.contracts import Motion, Plant, Reference
+from pinn_dyn.control.latent_plan import LatentMechanics
 from pinn_dyn.control.safe_law import SafeLaw
 from pinn_dyn.exports import c_loop
 from pinn_dyn.models import CoupledOscillators
@@ -239,6 +248,34 @@ def test_the_file_in_c_gives_the_inputs_of_the_loop(model, tmp_path, monkeypatch
     np.testing.assert_array_equal(u, found)
     np.testing.assert_array_equal(after[-law.memory_size :], memory[-law.memory_size :])
     assert status == 4
+
+
+def test_plans_have_no_steady_state_error_and_keep_the_limits(model):
+    pytest.importorskip("casadi")
+    low, high = ((model.mean[-2:] + s * model.std[-2:]).tolist() for s in (-0.41, 0.61))
+    setting = dict(integral_gain=0.2 / STEP, dead_time=STEP, actuator=Actuator(low, high))
+    law = LatentPlan(model, 8 * STEP, **setting)
+    found, steps = errors(model, law, delay=1.0)
+    assert (found[:, -1] < 1e-3 * steps).all()
+    u = torch.from_numpy(np.stack([plan.u for plan in law.planner.plans]))
+    low, high = torch.tensor([low, high])[..., None]
+    assert ((u >= low - 1e-6) & (u <= high + 1e-6)).all()
+
+
+def test_a_plan_takes_the_step_of_a_model_without_coupling(model):
+    """The midpoint rule is the step of the model, in seconds."""
+    linear = copy.deepcopy(model)
+    linear.coupling.zero_()
+    x = torch.randn(3, 12, generator=torch.manual_seed(0)).double()
+    u = torch.randn(3, 2).double()
+    A, B = linear.flow()
+    (z, v), (z_later, v_later) = (
+        y.chunk(2, dim=-1) for y in (x, x @ A.mT + linear.latent_force(u) @ B.mT)
+    )
+    middle = (z + z_later) / 2, (v + v_later) / 2 / STEP
+    a = LatentMechanics(linear).forward_dynamics(*middle, u)
+    torch.testing.assert_close(STEP * a, (v_later - v) / STEP)
+    torch.testing.assert_close(STEP * middle[1], z_later - z)
 
 
 def test_the_law_refuses_other_models():

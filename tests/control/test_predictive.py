@@ -40,7 +40,7 @@ def law():
     return PredictiveControl(pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
 
 
-def linear_problem(steps, Q, R):
+def linear_problem():
     """Return A, B of the midpoint rule, for two coupled springs."""
     F, B = damped_oscillators().state_space()
     left = np.linalg.inv(np.eye(4) - STEP / 2 * F)
@@ -50,7 +50,7 @@ def linear_problem(steps, Q, R):
 def test_without_limits_it_is_the_linear_quadratic_regulator():
     system, x = damped_oscillators().requires_grad_(False), np.array([0.3, -0.2, 0.5, 0.1])
     law = PredictiveControl(system, 0.3, STEP, velocity_weight=0.2, input_weight=0.05)
-    A, B = linear_problem(6, law.weights.state, law.weights.input)
+    A, B = linear_problem()
     Q, R = STEP * np.diag([1, 1, 0.2, 0.2]), STEP * 0.05 * np.eye(1)
     P = solve_discrete_are(A, B, Q, R)
     gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
@@ -63,7 +63,7 @@ def test_with_limits_it_is_the_bounded_least_squares_solution():
     steps, high = 8, 1.5
     settings = {"terminal_weight": 2.0, "actuator": Actuator(-high, high)}
     law = PredictiveControl(system, steps * STEP, STEP, input_weight=1e-2, **settings)
-    A, B = linear_problem(steps, None, None)
+    A, B = linear_problem()
     free = [np.linalg.matrix_power(A, k + 1) @ x for k in range(steps)]
     forced = np.zeros((steps, 4, steps))
     for k in range(steps):
