@@ -28,7 +28,8 @@ class LatentLaw(Controller):
     r"""Regulation and tracking in the coordinates z of :class:`CoupledOscillators`::
 
         u = u_d + K_P psi (z_d - z) + K_D psi (z_d' - z'),    psi = S C^+ F^T,    C = F^T H^-1 F
-        q(u_d) = q_ref - d,    z_d = z(u_d),    z_d' = H^-1 F J^+ v_ref,    J = dq/du
+        q(u_d) = q_s - d,    z_d = z(u_d),    z_d' = H^-1 F J^+ v_ref,    J = dq/du
+        dq_s/dt = v_ref + K_I (q_ref - q_s),    q_s = q at the first call
 
     q(u) and z(u) are the equilibrium of the model under a constant input u. F = df/du at u_d and
     the Hessian H of the potential belong to z_d. Inputs are divided by their standard deviations S
@@ -44,7 +45,9 @@ class LatentLaw(Controller):
     d is a random walk. Since the linearized model is stable by construction, (x, d) is detectable,
     and the eigenvalues of the error are inside the unit circle (:meth:`observer_poles`). d is the
     integral action: if the loop comes to rest, q = q_ref - d + d = q_ref, whatever the errors of
-    the model. d does not wind up while the motors are at their limits, since the model knows u.
+    the model. K_I is the bandwidth of d, and that of the set point q_s, against overshoot. q_s
+    follows smooth references without a lag. d does not wind up while the motors are at their
+    limits, since the model knows u.
 
     u_d takes one step of Newton's method per call, from the mean input of the data, and z_d two.
     With a dead time, the feedback uses the state that the model predicts at its end.
@@ -59,7 +62,7 @@ class LatentLaw(Controller):
         model: the model, in float64.
         position_gain: K_P, a factor of the stiffness against the inputs, without a unit.
         velocity_gain: K_D, s.
-        integral_gain: bandwidth of d, 1/s.
+        integral_gain: K_I, 1/s.
         dead_time: time after which an input acts, s.
         noise: standard deviation of measured q, in those of the training data.
         first_input: input before the first call, one number or M.
@@ -93,7 +96,9 @@ class LatentLaw(Controller):
         self._u_mean, self._u_std = model.mean[-M:], model.std[-M:]
         self._q_std, self._center = model.std[:N], model.linearize(model.mean[-M:])
         self._first_target = model.rest(self.actuator.limit(self._u_mean))[0]
-        self.memory_size = 1 + 3 * len(model.bias) + N + M
+        n = len(model.bias)
+        self._sizes = [1, 2 * n, N, N, M, n]
+        self.memory_size = sum(self._sizes)
         self.prepare(model.fixed_step)
         self.reset()
 
@@ -169,8 +174,7 @@ class LatentLaw(Controller):
 
     def goal(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return x at the end of the dead time, u_d and z_d of the latest call."""
-        n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
-        _, x, _, u_d, z_d = self._memory.split([1, 2 * n, N, M, n], dim=-1)
+        _, x, _, _, u_d, z_d = self._memory.split(self._sizes, dim=-1)
         with torch.no_grad():
             return self._predicted(x, self._past[..., :-1, :]), u_d, z_d
 
@@ -205,10 +209,9 @@ class LatentLaw(Controller):
         Args:
             q, v, q_ref, v_ref: measurement and reference, ``(*batch, N)``.
             past: last inputs, the latest last, ``(*batch, stored_inputs, M)``.
-            memory: ``(*batch, S)``, which is zero before the first call: 1, x, d, u_d and z_d.
+            memory: ``(*batch, S)``, which is zero before the first call: 1, x, d, q_s, u_d and z_d.
         """
-        n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
-        started, x, d, u_d, z_d = memory.split([1, 2 * n, N, M, n], dim=-1)
+        started, x, d, q_s, u_d, z_d = memory.split(self._sizes, dim=-1)
         is_later = started > 0.5
         past = self.past_of(past, memory)
         first = self._first(q, v, self._first_input.expand(u_d.shape))
@@ -217,7 +220,9 @@ class LatentLaw(Controller):
         at = self.model.linearize(u_d, z_d, _NEWTON_STEPS)
         F = at.input * self._u_std
         compliant = torch.cholesky_solve(F, torch.linalg.cholesky_ex(at.stiffness).L)
-        error = (q_ref - d - at.q) / self._q_std
+        decay = math.exp(-self.integral_gain * self._period)
+        q_s = torch.where(is_later, q_ref + decay * (q_s + self._period * v_ref - q_ref), q)
+        error = (q_s - d - at.q) / self._q_std
         J = at.output[..., : at.z.shape[-1]] / self._q_std[:, None] @ compliant
         inverse = torch.linalg.pinv(J, rtol=_RANK)
         change = self._u_std * matvec(inverse, error).clamp(-1.0, 1.0)
@@ -225,7 +230,7 @@ class LatentLaw(Controller):
         rate_d = matvec(compliant @ inverse, v_ref / self._q_std)
         slopes, wanted = (F, compliant), (at.z, rate_d, u_d)
         u = u_d + self._u_std * self._feedback(self._predicted(x, past), is_later, *slopes, *wanted)
-        memory = torch.cat([torch.ones_like(started), x, d, u_d, at.z], dim=-1)
+        memory = torch.cat([torch.ones_like(started), x, d, q_s, u_d, at.z], dim=-1)
         return u, memory, error.square().sum(-1, keepdim=True).sqrt()
 
     def past_of(self, past: Tensor, memory: Tensor) -> Tensor:
@@ -290,5 +295,5 @@ class LatentLaw(Controller):
         return torch.linalg.solve(one + change, matvec(psi, wanted).unsqueeze(-1))[..., 0]
 
     def diagnostics(self) -> dict[str, Tensor]:
-        """Return ``static_residual``: |q(u_d) - q_ref + d| in standard deviations of q."""
+        """Return ``static_residual``: |q(u_d) - q_s + d| in standard deviations of q."""
         return {} if self._residual is None else {"static_residual": self._residual}
