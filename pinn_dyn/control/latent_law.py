@@ -49,8 +49,8 @@ class LatentLaw(Controller):
     follows smooth references without a lag. d does not wind up while the motors are at their
     limits, since the model knows u.
 
-    u_d takes one step of Newton's method per call, from the mean input of the data, and z_d two.
-    With a dead time, the feedback uses the state that the model predicts at its end.
+    u_d takes one step of Newton's method per call, from the first input, and z_d two. With a dead
+    time, the feedback uses the state that the model predicts at its end.
 
     Assumptions: the robot starts at rest with a known input; the loop is stable, which is not
     proven under sampling, dead time and errors of the model: simulate it.
@@ -95,7 +95,7 @@ class LatentLaw(Controller):
         M, N = self.num_inputs, self.num_coordinates
         self._u_mean, self._u_std = model.mean[-M:], model.std[-M:]
         self._q_std, self._center = model.std[:N], model.linearize(model.mean[-M:])
-        self._first_target = model.rest(self.actuator.limit(self._u_mean))[0]
+        self._first_target = model.rest(self._first_input.expand(M))[0]
         n = len(model.bias)
         self._sizes = [1, 2 * n, N, N, M, n]
         self.memory_size = sum(self._sizes)
@@ -242,7 +242,7 @@ class LatentLaw(Controller):
         past = (x.repeat(*[1] * (x.ndim - 1), self.model.past_steps) for x in (q, u))
         x = self.model.start(q, v, u, *past)[..., : 2 * len(self.model.bias)]
         z_d = self._first_target.expand(*x.shape[:-1], -1)
-        return x, q - self.model.observe(x), self.actuator.limit(self._u_mean).expand_as(u), z_d
+        return x, q - self.model.observe(x), u, z_d
 
     def _observed(self, q: Tensor, x: Tensor, d: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
         """Move the estimate by a period with the inputs that acted, after its correction."""

@@ -62,6 +62,11 @@ class _Planner(PredictiveControl):
         ]
         return np.vstack(rows)
 
+    def _start(self, t: float, states: np.ndarray) -> None:
+        super()._start(t, states)
+        start = zip(self._memory, self.u_ref, strict=True)
+        self._memory = [memory._replace(u=u) for memory, u in start]
+
     def _feedforward(self, q: Tensor, v: Tensor, a: Tensor) -> np.ndarray:
         return np.repeat(self.u_ref[:, None], q.shape[-2], axis=1)
 
