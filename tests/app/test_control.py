@@ -247,8 +247,12 @@ def oscillators_run(run_of):
     return run_of("oscillators")
 
 
-def test_oscillators_control_beside_pid_and_the_true_terms(tmp_path, oscillators_run, undrawn):
-    folder = control(tmp_path / "out", oscillators_run, "controllers=latent", "rate=100")
+def test_oscillators_control_beside_pid_and_the_true_terms(
+    tmp_path, oscillators_run, undrawn, few_states
+):
+    words = "controllers=latent", "rate=100", f"export={tmp_path / 'law.c'}"
+    folder = control(tmp_path / "out", oscillators_run, *words)
+    assert "LatentLaw" in (tmp_path / "law.h").read_text()
     summary = pd.read_csv(folder / "summary.csv").set_index("controller")
     assert list(summary.index) == ["learned", "pid", "truth"]
     assert np.isfinite(summary["rms_error"]).all()
@@ -261,7 +265,6 @@ def test_oscillators_control_beside_pid_and_the_true_terms(tmp_path, oscillators
     [
         (["guard.threshold=1"], "guard: a law on oscillators has no guard"),
         (["stability={region: r, q_low: [0,0,0], q_high: [1,1,1], samples: 5}"], "stability"),
-        (["export=law.c"], "export=law.c"),
         (["controllers=regulation"], "CoupledOscillators"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,
