@@ -346,7 +346,8 @@ class Run:
         ``predict(start, u, t)`` simulates the model, and returns the states x(t_k), ``(*batch, T,
         2N)``. The input between its samples is interpolated as in the training data, and acts after
         the ``delay`` of the data set; before the first sample it is constant. With a C compiler, a
-        loop in C is built after 1,500 steps of the model, and all later calls use it.
+        loop in C is built after 1,500 steps of the model (75,000 of a latent state), and all later
+        calls use it.
 
         ``predict(frame)`` returns q and v in the columns, units and index of a log, whose columns
         the frame needs. It is cleaned by the same steps. Every run starts from its first row.
