@@ -164,13 +164,11 @@ def _law(
 ) -> Controller:
     """Build a law with its observer, guard and compensation of the delay, for loop and export."""
     law = build_law(config, name, learned, truth)
-    if isinstance(law, LatentPlan):
-        law.law.dead_time = float(np.max(run.input_delay, initial=0.0))
-        return law
-    if isinstance(law, LatentLaw):
+    latent = law.law if isinstance(law, LatentPlan) else law
+    if isinstance(latent, LatentLaw):
         if config["guard"].get("threshold") is not None:
             raise ConfigError("guard: a law on oscillators has no guard: leave the key out")
-        law.dead_time = float(np.max(run.input_delay, initial=0.0))
+        latent.dead_time = float(np.max(run.input_delay, initial=0.0))
         return law
     if isinstance(law, MotorPID):
         return law
