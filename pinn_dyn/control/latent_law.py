@@ -19,6 +19,7 @@ from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import CoupledOscillators
 
 _PROCESS = 1e-3  # standard deviation of unknown inputs, in those of the data
+_BANDWIDTH = 0.2  # smallest bandwidth of q_s times the step of the model
 _NEWTON_STEPS = 2  # per call, to z_d
 _ROUNDING = 1e-9  # of periods
 _RANK = 1e-3  # singular values below this share of the largest are zero
@@ -29,7 +30,7 @@ class LatentLaw(Controller):
 
         u = u_d + K_P psi (z_d - z) + K_D psi (z_d' - z'),    psi = S C^+ F^T,    C = F^T H^-1 F
         q(u_d) = q_s - d,    z_d = z(u_d),    z_d' = H^-1 F J^+ v_ref,    J = dq/du
-        dq_s/dt = v_ref + K_I (q_ref - q_s),    q_s = q at the first call
+        dq_s/dt = v_ref + max(K_I, 0.2/T) (q_ref - q_s),    q_s = q at the first call
 
     q(u) and z(u) are the equilibrium of the model under a constant input u. F = df/du at u_d and
     the Hessian H of the potential belong to z_d. Inputs are divided by their standard deviations S
@@ -45,8 +46,8 @@ class LatentLaw(Controller):
     d is a random walk. Since the linearized model is stable by construction, (x, d) is detectable,
     and the eigenvalues of the error are inside the unit circle (:meth:`observer_poles`). d is the
     integral action: if the loop comes to rest, q = q_ref - d + d = q_ref, whatever the errors of
-    the model. K_I is the bandwidth of d, and that of the set point q_s, against overshoot. q_s
-    follows smooth references without a lag. d does not wind up while the motors are at their
+    the model. K_I is the bandwidth of d. The set point q_s is filtered against overshoot, with the
+    step T of the model, and follows smooth references without a lag. d does not wind up while the motors are at their
     limits, since the model knows u.
 
     u_d takes one step of Newton's method per call, from the first input, and z_d two. With a dead
@@ -220,7 +221,8 @@ class LatentLaw(Controller):
         at = self.model.linearize(u_d, z_d, _NEWTON_STEPS)
         F = at.input * self._u_std
         compliant = torch.cholesky_solve(F, torch.linalg.cholesky_ex(at.stiffness).L)
-        decay = math.exp(-self.integral_gain * self._period)
+        rate = max(self.integral_gain, _BANDWIDTH / self.model.fixed_step)
+        decay = math.exp(-rate * self._period)
         q_s = torch.where(is_later, q_ref + decay * (q_s + self._period * v_ref - q_ref), q)
         error = (q_s - d - at.q) / self._q_std
         J = at.output[..., : at.z.shape[-1]] / self._q_std[:, None] @ compliant
