@@ -47,8 +47,8 @@ class LatentLaw(Controller):
     and the eigenvalues of the error are inside the unit circle (:meth:`observer_poles`). d is the
     integral action: if the loop comes to rest, q = q_ref - d + d = q_ref, whatever the errors of
     the model. K_I is the bandwidth of d. The set point q_s is filtered against overshoot, with the
-    step T of the model, and follows smooth references without a lag. d does not wind up while the motors are at their
-    limits, since the model knows u.
+    step T of the model, and follows smooth references without a lag. d does not wind up while the
+    motors are at their limits, since the model knows u.
 
     u_d takes one step of Newton's method per call, from the first input, and z_d two. With a dead
     time, the feedback uses the state that the model predicts at its end.
