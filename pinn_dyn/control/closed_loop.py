@@ -71,7 +71,8 @@ def close_loop(
         ):
             plant.start(q0, v0)
             for k in range(len(run.t)):
-                lines.update(k)
+                if k > 1:  # the first instants may build code, which would spoil the estimate
+                    lines.update(k)
                 if not torch.equal(moving, run.running):
                     moving = run.running.clone()
                     plant.start(q[moving], v[moving])
