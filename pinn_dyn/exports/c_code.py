@@ -50,7 +50,7 @@ REDUCTIONS = {
 Index = Sequence[str]
 
 
-class Constants:
+class ConstantArrays:
     """Arrays that the functions of a C file share, each stored once.
 
     Args:
@@ -159,7 +159,7 @@ class CFunction:
             the arrays, since GCC adds up to 1.1 of them at ``-O3``, and 1 kB, also for libm.
     """
 
-    def __init__(self, program: Program, constants: Constants):
+    def __init__(self, program: Program, constants: ConstantArrays):
         self.constants = constants
         self.lines: list[str] = []
         self._arrays: dict[int, str] = {}

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pinn_dyn.exports.c_code import PRELUDE, Constants
+from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.escaping import c_text
 from pinn_dyn.exports.exported import Calls, ExportedFunction, Real, identifier
 from pinn_dyn.exports.program import Program
@@ -46,7 +46,7 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     text of ``info`` with the SHA-256 of the code.
     """
     name = identifier(path.stem)
-    constants = Constants(real)
+    constants = ConstantArrays(real)
     called: dict[str, tuple[Program, CBody]] = {}
     programs, bodies = [], []
     for function in functions:

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import Tensor
 
-from pinn_dyn.exports.c_code import PRELUDE, Constants
+from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.c_file import compile_c, find_compiler
 from pinn_dyn.exports.program import trace
 from pinn_dyn.exports.scalar_code import c_function
@@ -70,7 +70,7 @@ def compiled_rows(
 
 def _code_of_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> str:
     program = trace(function, {"x": x}, ["y"])
-    constants = Constants("double")
+    constants = ConstantArrays("double")
     lines = c_function(program, constants).lines
     (n,), (m,) = x.shape, function(x).shape
     code = ["typedef double real;", PRELUDE, *constants.definitions()]

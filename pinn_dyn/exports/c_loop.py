@@ -23,7 +23,7 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from pinn_dyn.exports.c_code import PRELUDE, Constants
+from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.c_file import find_compiler
 from pinn_dyn.exports.c_lanes import LOOP, ONE, SEVERAL
 from pinn_dyn.exports.c_library import QUICK, compiled_rows, load_code, recall, remember
@@ -179,7 +179,7 @@ def loop_code(
     return "\n".join(parts), values
 
 
-class Numbers(Constants):
+class Numbers(ConstantArrays):
     """Constants that are arguments of the code.
 
     Attributes:

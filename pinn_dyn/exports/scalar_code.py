@@ -12,7 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor, fx
 
-from pinn_dyn.exports.c_code import ELEMENTWISE, REDUCTIONS, CFunction, Constants, is_mask_as_number
+from pinn_dyn.exports.c_code import (
+    ELEMENTWISE,
+    REDUCTIONS,
+    CFunction,
+    ConstantArrays,
+    is_mask_as_number,
+)
 from pinn_dyn.exports.program import MOVES, Program, moved, operation, unsupported
 
 _KNOWN: dict[str, Callable[..., float]] = {
@@ -31,7 +37,7 @@ Term = int
 """Number of an entry of the list of terms."""
 
 
-class Terms:
+class ScalarTerms:
     """Numbers as operations on earlier numbers. Equal operations are the same term.
 
     Products with 0 and 1 and sums with 0 are not computed, which needs finite numbers.
@@ -155,8 +161,8 @@ class ScalarFunction:
         stack: upper bound of the bytes on the stack, with an optimization of ``-O1`` or more.
     """
 
-    def __init__(self, program: Program, constants: Constants):
-        self._constants, self._terms = constants, Terms()
+    def __init__(self, program: Program, constants: ConstantArrays):
+        self._constants, self._terms = constants, ScalarTerms()
         self._of: dict[fx.Node, Any] = {}
         graph, results = program.graph_module.graph, program.results()
         for name, node in zip(program.inputs, graph.find_nodes(op="placeholder"), strict=True):
@@ -346,7 +352,7 @@ def _most_live(lines: Sequence[str]) -> int:
 CBody = CFunction | ScalarFunction
 
 
-def c_function(program: Program, constants: Constants) -> CBody:
+def c_function(program: Program, constants: ConstantArrays) -> CBody:
     """Return a function without loops if the program has no large matrix of learned numbers."""
     return (
         ScalarFunction(program, constants) if _is_scalar(program) else CFunction(program, constants)

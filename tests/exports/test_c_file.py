@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pinn_dyn.exports import exported
-from pinn_dyn.exports.c_code import ELEMENTWISE, Constants
+from pinn_dyn.exports.c_code import ELEMENTWISE, ConstantArrays
 from pinn_dyn.exports.exported import ExportedFunction, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.run.export import export
@@ -217,7 +217,7 @@ def test_entries_that_are_assigned_are_in_the_code(tmp_path):
 
 
 def test_numbers_are_written_exactly():
-    constants = Constants("double")
+    constants = ConstantArrays("double")
     values = [0.1, -1e-300, 1 / 3, float("inf"), float("-inf"), float("nan"), -0.0]
     texts = [constants.number(x) for x in values]
     assert texts[3:6] == ["INFINITY", "(-INFINITY)", "NAN"]

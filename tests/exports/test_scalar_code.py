@@ -11,7 +11,7 @@ import torch
 
 from pinn_dyn.exports.c_loop import Loop, loop_code, traced
 from pinn_dyn.exports.exported import ExportedFunction, write
-from pinn_dyn.exports.scalar_code import Terms
+from pinn_dyn.exports.scalar_code import ScalarTerms
 from pinn_dyn.testing import LinearSystem
 from tests.support.c_code import compiled
 from tests.support.processes import fork
@@ -61,7 +61,7 @@ def leaf(terms, value):
 def test_rules_for_known_numbers_do_not_change_a_result(name):
     pools = POOLS.get(name, [NUMBERS] * (1 if name == "neg" else 2))
     for operands in itertools.product(*pools):
-        terms = Terms()
+        terms = ScalarTerms()
         leaves = [leaf(terms, x) for x in operands]
         expected = float(RULES[name](*(evaluated(terms, x) for x in leaves)))
         result = float(evaluated(terms, terms.apply(name, *leaves)))
