@@ -78,7 +78,7 @@ class Robots(VecEnv):
         return [None] * self.num_envs
 
     def set_attr(self, name, value, indices=None):
-        raise NotImplementedError
+        raise NotImplementedError  # PPO does not call it
 
     env_method = set_attr
 

@@ -50,8 +50,8 @@ class LatentLaw(Controller):
     step T of the model, and follows smooth references without a lag. d does not wind up while the
     motors are at their limits, since the model knows u.
 
-    u_d takes one step of Newton's method per call, from the first input, and z_d two. With a dead
-    time, the feedback uses the state that the model predicts at its end.
+    A call takes one step of Newton's method to u_d, which starts at the first input, and two steps
+    to z_d. With a dead time, the feedback uses the state that the model predicts at its end.
 
     Assumptions: the robot starts at rest with a known input; the loop is stable, which is not
     proven under sampling, dead time and errors of the model: simulate it.

@@ -12,7 +12,7 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.latent_law import LatentLaw
-from pinn_dyn.control.predictive import PredictiveControl, _Weight
+from pinn_dyn.control.predictive import PredictiveControl, Weight
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.models import CoupledOscillators
 
@@ -50,7 +50,7 @@ class _Planner(PredictiveControl):
     model: LatentMechanics  # type: ignore[assignment]
     u_ref: np.ndarray
 
-    def _state_weight(self, position: _Weight, velocity: _Weight) -> np.ndarray:
+    def _state_weight(self, position: Weight, velocity: Weight) -> np.ndarray:
         model, N, M = self.model.model, self.model.model.num_coordinates, self.num_inputs
         output = model.linearize(model.mean[-M:]).output.chunk(2, dim=-1)
         of_z, of_rate = ((x / model.std[:N, None]).numpy() for x in output)

@@ -25,7 +25,8 @@ _FIRST_ITERATIONS = 20  # times as many iterations at the first instant, without
 _LARGEST_GAP = 0.1  # largest gap of a plan that counts as a solution
 _LIMIT_WEIGHT = 1e3  # rho of a violated limit of the state
 _Values = float | Sequence[float] | None
-_Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
+Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
+"""Weight of all coordinates or inputs, or of each."""
 
 
 class _Memory(NamedTuple):
@@ -79,10 +80,10 @@ class PredictiveControl(Controller):
         horizon: PositiveFloat,
         step: PositiveFloat,
         *,
-        position_weight: _Weight = 1.0,
-        velocity_weight: _Weight = 0.1,
+        position_weight: Weight = 1.0,
+        velocity_weight: Weight = 0.1,
         input_weight: Annotated[float, Field(gt=0)] | Sequence[PositiveFloat] = 1e-3,
-        rate_weight: _Weight = 0.0,
+        rate_weight: Weight = 0.0,
         terminal_weight: NonNegativeFloat | None = None,
         actuator: Actuator | None = None,
         q_low: _Values = None,
@@ -124,7 +125,7 @@ class PredictiveControl(Controller):
         self._reference: Reference | None = None
         self.reset()
 
-    def _state_weight(self, position: _Weight, velocity: _Weight) -> np.ndarray:
+    def _state_weight(self, position: Weight, velocity: Weight) -> np.ndarray:
         """Return the factor of Q, see :class:`~.shooting.Weights`."""
         rows = (("position_weight", position), ("velocity_weight", velocity))
         values = [_row(name, value, self.num_coordinates) for name, value in rows]

@@ -75,7 +75,7 @@ class DynamicsData:
             log.info("data.stride=auto is %.4g ms", 1e3 * count * sample_time)
             return count
         if isinstance(self.stride, str):
-            length = seconds_of("stride", self.stride)
+            length = seconds_of("stride", self.stride, "'auto', ")
             return samples_of("stride", length, self.splits.train[0].t)
         return self.stride
 

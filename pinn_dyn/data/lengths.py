@@ -10,8 +10,8 @@ Length = int | str
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 
 
-def seconds_of(name: str, length: str) -> float:
-    """Convert a length such as ``"20 ms"`` to s.
+def seconds_of(name: str, length: str, others: str = "") -> float:
+    """Convert a length such as ``"20 ms"`` to s; ``others`` names further values in the error.
 
     Raises:
         ValueError: on any other text, or a time that is not positive.
@@ -19,5 +19,6 @@ def seconds_of(name: str, length: str) -> float:
     units = "|".join(_SECONDS)
     match = re.fullmatch(rf"\s*(\d+\.?\d*(?:e-?\d+)?|\.\d+)\s*({units})\s*", length)
     if match is None or not float(match[1]) > 0:
-        raise ValueError(f"{name} is {length!r}, expected samples, such as 5, or such as '20 ms'")
+        expected = f"{others}samples, such as 5, or such as '20 ms'"
+        raise ValueError(f"{name} is {length!r}, expected {expected}")
     return float(match[1]) * _SECONDS[match[2]]

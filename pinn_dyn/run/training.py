@@ -134,7 +134,8 @@ def train(
             place.
         loss: builder, called with ``statistics=`` and ``model=``; or ``"increment"`` or
             ``"midpoint"``; None takes the increment loss.
-        optimizer: builder, called with the parameters; or a least-squares fit; None takes AdamW.
+        optimizer: builder, called with the parameters; or a least-squares fit; None takes AdamW,
+            for oscillators with a higher learning rate and weight decay.
         scheduler: builder, called with the optimizer and ``total_steps=``.
         data: builder of the training windows, called with ``source=``; None takes windows of two
             steps of about 20 ms from a log (ten for least squares and subnet), and the defaults of

@@ -11,7 +11,7 @@ MARK = "was_here"
 
 
 def calls(mark):
-    """What would leave the mark, in many ways, each a ``_target_`` with its arguments."""
+    """Return ways to leave the mark, each a ``_target_`` with its arguments."""
     touch = f"touch {mark}"
     code = f"open({mark!r}, 'w')"
     return [

@@ -57,7 +57,7 @@ def along_a_line(data, count=200):
 
 
 class OutsideTheData:
-    """What a network ``system`` must satisfy at states up to ``times`` the range of its data.
+    """Requirements of a network ``system`` at states up to ``times`` the range of its data.
 
     ``ranges`` are the smallest and largest (q, v) or (q, p) in the data, ``(2, 2N)``, and ``seen``
     are the configurations, ``(K, N)``, that the network has its limits from.
