@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
-from pinn_dyn.exports.c_file import compile_c, find_compiler
-from pinn_dyn.exports.program import trace
+from pinn_dyn.exports.c_file import compile_c, find_compiler, static_functions
+from pinn_dyn.exports.repeated import programs
 from pinn_dyn.exports.scalar_code import c_function
 
 log = logging.getLogger(__name__)
@@ -69,11 +69,12 @@ def compiled_rows(
 
 
 def _code_of_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> str:
-    program = trace(function, {"x": x}, ["y"])
-    constants = ConstantArrays("double")
-    lines = c_function(program, constants).lines
+    parts, constants = programs("row", function, {"x": x}, ["y"]), ConstantArrays("double")
+    bodies = {name: (program, c_function(program, constants)) for name, program in parts.items()}
+    _, body = bodies.pop("row")
+    lines = body.lines
     (n,), (m,) = x.shape, function(x).shape
-    code = ["typedef double real;", PRELUDE, *constants.definitions()]
+    code = ["typedef double real;", PRELUDE, *constants.definitions(), *static_functions(bodies)]
     code += ["static void row(const real *restrict x, real *restrict y)", "{", *lines, "}"]
     code += [
         "void rows(long count, const real *x, real *y)",

@@ -11,7 +11,7 @@ from torch import Tensor, fx
 from torch._decomp import core_aten_decompositions, get_decompositions
 from torch._guards import TracingContext, tracing
 from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.proxy_tensor import get_proxy_mode, make_fx
 
 from pinn_dyn.exports.decompositions import DECOMPOSITIONS
 from pinn_dyn.mechanics.integrators import Sticking
@@ -109,6 +109,11 @@ def unsupported(node: fx.Node, form: str) -> TypeError:
     return TypeError(
         f"{node.target}{line}: {form} has no such operation, write the head with others"
     )
+
+
+def is_traced() -> bool:
+    """Return true while :func:`trace` records a function: its operations may not branch."""
+    return get_proxy_mode() is not None
 
 
 def trace(
