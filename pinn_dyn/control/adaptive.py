@@ -68,7 +68,7 @@ class AdaptiveTracking(ModelBasedLaw):
         TypeError: on a model without a rigid chain.
     """
 
-    needs_period, stiffness = True, None
+    needs_period = True
 
     def __init__(
         self,
@@ -123,6 +123,9 @@ class AdaptiveTracking(ModelBasedLaw):
         if self.sizes[0]:
             report = {**report, "adapted_mass": self._inertia(constants)[..., 3, 3]}
         return Step(u, torch.cat([constants, adapted, u], dim=-1), report)
+
+    def stiffness(self) -> None:
+        """Return None: the position gain is in 1/s."""
 
     def changes(self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor) -> Tensor:
         """Return the rates of change B^T S B, of log f and of o / b, ``(*batch, R)``."""

@@ -199,8 +199,8 @@ class _Run:
         motions = [motion_of_copies(self._reference, float(x), self._like) for x in t]
         reference = Motion(*(torch.stack(x, 1) for x in zip(*motions, strict=True)))
         columns = {name: x[:, : len(t)] for name, x in self._columns.items()}
-        states = [columns.pop(name) for name in ("q", "v", "u", "u_wanted")]
-        return ClosedLoopRecord(t, *states, reference, self._stopped, columns)
+        q, v, u, u_wanted = (columns.pop(name) for name in ("q", "v", "u", "u_wanted"))
+        return ClosedLoopRecord(t, q, v, u, u_wanted, reference, self._stopped, columns)
 
 
 def _instants(duration: float, rate: float) -> Tensor:

@@ -77,7 +77,6 @@ class Stage(abc.ABC):
         needs_period: true for a stage with a memory of time.
         ahead: times from the measurement to the references that a call takes, s.
         model: the model of the law, or None; its ``dead_time`` is that of its run.
-        stiffness: K_P in N/m or Nm/rad and K_D of the law, or None for a law without them.
         first_input: input before the first call, one number or M.
         is_python: true for a stage whose operations depend on numbers: it has no code in C.
         is_long: true for a stage with so much code that closed loops do not compile it.
@@ -89,7 +88,6 @@ class Stage(abc.ABC):
     needs_period = False
     ahead: tuple[float, ...] = (0.0,)
     model: Any = None
-    stiffness: tuple[Tensor, Tensor] | None = None
     first_input: Values = 0.0
     is_python = False
     is_long = False
@@ -107,6 +105,10 @@ class Stage(abc.ABC):
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor | None:
         """Return the memory before the first call with the measurement q, v; None for zeros."""
+        return None
+
+    def stiffness(self) -> tuple[Tensor, Tensor] | None:
+        """Return K_P in N/m or Nm/rad and K_D, or None for a law without them."""
         return None
 
     def about(self) -> dict[str, Any]:
@@ -144,7 +146,7 @@ class Wrapper(Stage):
 
     def _adopt(self, law: Stage) -> None:
         self.law, self.memory_size = law, self.own_size + law.memory_size
-        for name in ("ahead", "model", "stiffness", "first_input", *_KINDS):
+        for name in ("ahead", "model", "first_input", *_KINDS):
             setattr(self, name, getattr(law, name))
         self.needs_period = law.needs_period or self.own_size > 0
 
@@ -152,6 +154,9 @@ class Wrapper(Stage):
         stage = super().at(setting)
         stage._adopt(self.law.at(setting))
         return stage
+
+    def stiffness(self) -> tuple[Tensor, Tensor] | None:
+        return self.law.stiffness()
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor | None:
         memory = self.law.start(q, v, u)

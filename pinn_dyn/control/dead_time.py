@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pinn_dyn.exports.model_functions import held_step
-from pinn_dyn.exports.repeated import repeated
+from pinn_dyn.exports.repeated import repeated, sharing
 from pinn_dyn.mechanics import MechanicalSystem
 
 _ROUNDING = 1e-6  # of periods
@@ -54,15 +54,18 @@ class DeadTime:
 
     def predict(self, q: Tensor, v: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
         """Return q and v after the dead time, from the last n inputs ``(*batch, n, M)``."""
-        substeps = self.model.integrator.substeps
+        model = sharing(self.model)
+        substeps = model.integrator.substeps
         lengths = (self._lengths / substeps).unsqueeze(-1).expand(*past.shape[:-1], 1)
         rows = torch.cat([past, lengths], dim=-1).repeat_interleave(substeps, dim=-2)
 
         def step(x: Tensor, row: Tensor) -> Tensor:
             h = row.reshape(-1, row.shape[-1])[0, -1]  # the same for all states
-            return torch.cat(held_step(self.model, *x.chunk(2, dim=-1), row[..., :-1], h), dim=-1)
+            q, v = x.chunk(2, dim=-1)
+            return torch.cat(held_step(model, q, v, row[..., :-1], h), dim=-1)
 
-        return repeated(step, torch.cat([q, v], dim=-1), rows).chunk(2, dim=-1)
+        q, v = repeated("step", step, torch.cat([q, v], dim=-1), rows).chunk(2, dim=-1)
+        return q, v
 
     def held_back(self, inputs: Tensor) -> Tensor:
         """Return the input to apply ``(*batch, M)``, of the last n and the new one."""

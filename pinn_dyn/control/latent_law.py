@@ -12,6 +12,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Motion, Setting, Stage, Step
+from pinn_dyn.control.effects import Actuator
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import CoupledOscillators
 
@@ -72,6 +73,13 @@ class LatentLaw(Stage):
     """
 
     needs_period, predicts = True, True
+    _actuator: Actuator
+    _first_target: Tensor
+    _gain: Tensor
+    _flow: tuple[Tensor, Tensor]
+    _wait: tuple[Tensor, Tensor]
+    _stored: int
+    _sizes: list[int]
 
     def __init__(
         self,
@@ -88,6 +96,7 @@ class LatentLaw(Stage):
             raise TypeError(f"model is a {type(model).__name__}, expected CoupledOscillators")
         super().__init__(model.num_coordinates, model.num_inputs)
         self.model, self.dead_time, self.noise = model, dead_time, noise
+        self._late = dead_time or 0.0
         self.position_gain, self.velocity_gain = float(position_gain), float(velocity_gain)
         self.integral_gain = float(integral_gain)
         self.first_input = first_input
@@ -99,12 +108,12 @@ class LatentLaw(Stage):
         law: LatentLaw = super().at(setting)
         period = setting.period
         law._actuator = setting.actuator
-        law.dead_time = setting.dead_time if self.dead_time is None else self.dead_time
+        law._late = setting.dead_time if self.dead_time is None else self.dead_time
         law._first_target = self.model.rest(setting.first_input)[0]
         law._gain, _ = self.observer_gain(period)
         law._flow = self.model.flow(period / self.model.fixed_step)
-        law._wait = self.model.flow(law.dead_time / self.model.fixed_step)
-        law._stored = int(law.dead_time / period + _ROUNDING) + 1
+        law._wait = self.model.flow(law._late / self.model.fixed_step)
+        law._stored = int(law._late / period + _ROUNDING) + 1
         n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
         law._sizes = [2 * n, N, N, M, n, law._stored * M]
         law.memory_size = sum(law._sizes)
@@ -170,7 +179,7 @@ class LatentLaw(Stage):
     def _observed(self, q: Tensor, x: Tensor, d: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
         """Move the estimate by a period with the inputs that acted, after its correction."""
         whole = self._stored - 1
-        share = self.dead_time / self.period - whole  # of the period, for the older input
+        share = self._late / self.period - whole  # of the period, for the older input
         newer, older = past[..., -1 - whole, :], past[..., -2 - whole, :]
         moved = self._moved(x, self._flow, newer.lerp(older, share))
         error = (q - self.model.observe(moved) - d) / self._q_std
@@ -183,9 +192,9 @@ class LatentLaw(Stage):
 
     def _predicted(self, x: Tensor, past: Tensor) -> Tensor:
         """Return the state at the end of the dead time, under the mean input until then."""
-        if not self.dead_time:
+        if not self._late:
             return x
-        waiting = math.ceil(self.dead_time / self.period - _ROUNDING)
+        waiting = math.ceil(self._late / self.period - _ROUNDING)
         return self._moved(x, self._wait, past[..., -waiting:, :].mean(-2))
 
     def _feedback(

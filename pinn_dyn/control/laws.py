@@ -86,9 +86,7 @@ class ModelBasedLaw(Stage):
         tau, feedback = self._forces(q, v, reference)
         return self._input(q, v, tau, feedback, applied, memory)
 
-    @property
     def stiffness(self) -> tuple[Tensor, Tensor] | None:
-        """K_P in N/m or Nm/rad and K_D."""
         return self.position_gain, self.velocity_gain
 
     @abc.abstractmethod
@@ -192,7 +190,8 @@ class ComputedTorque(ModelBasedLaw):
     damped. Arguments and errors: :class:`ModelBasedLaw`.
     """
 
-    stiffness = None
+    def stiffness(self) -> None:
+        """Return None: the gains are in 1/s^2 and 1/s."""
 
     def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, None]:
         a = reference.a + self._feedback(q, v, reference)

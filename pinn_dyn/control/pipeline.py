@@ -142,7 +142,9 @@ class Pipeline(nn.Module):
         inputs = torch.cat([past, limited.unsqueeze(-2)], dim=-2)
         changed = (limited != wanted).to(u).sum(-1)
         marks = {**report, "limited": changed > 0, "not_finite": ~is_finite[..., 0]}
-        status = sum(bit * marks[name].to(u) for name, bit in STATUS.items() if name in marks)
+        status = torch.zeros_like(changed)
+        for name, mark in marks.items():
+            status = status + STATUS.get(name, 0) * mark.to(u)
         memory = torch.cat([torch.ones_like(started), inputs[..., 1:, :].flatten(-2), memory], -1)
         output = self._dead_time.held_back(inputs) if self._dead_time else limited
         numbers = {name: value.to(u) for name, value in report.items()}

@@ -14,7 +14,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Motion, Stage, Step
-from pinn_dyn.control.effects import Actuator
+from pinn_dyn.control.effects import Actuator, Values
 from pinn_dyn.control.shooting import Limits, Plan, ShootingProblem, Weights
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import pseudo_inverse_times
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 _FIRST_ITERATIONS = 20  # times as many iterations at the first instant, without a previous plan
 _LARGEST_GAP = 0.1  # largest gap of a plan that counts as a solution
 _LIMIT_WEIGHT = 1e3  # rho of a violated limit of the state
-_Values = float | Sequence[float] | None
+_Values = Values | None
 Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
 """Weight of all coordinates or inputs, or of each."""
 
@@ -254,7 +254,8 @@ class PredictiveControl(Stage):
             if not has_plan:
                 self._warn_of_excess(k, plan)
         failures = failures + 1 if failed else 0
-        parts = [[1.0], x, d, [failures], [not failed], *(np.ravel(y) for y in previous)]
+        marks = np.array([float(failures), float(not failed)])
+        parts = [np.ones(1), x, d, marks, *(np.ravel(y) for y in previous)]
         duration = time.perf_counter() - begin
         report = {
             "solve_time": duration,

@@ -143,13 +143,14 @@ class Guarded(Wrapper):
     ):
         super().__init__(law)
         self.region, self.threshold, self.fallback = region, threshold, fallback
+        gains = law.stiffness()
         if fallback == "regulation":
-            if law.stiffness is None:
+            if gains is None:
                 raise ValueError(
                     f"fallback regulation needs gains in Nm/rad, and those of "
                     f"{type(law).__name__} have other units: use the fallback hold"
                 )
-            self._regulation = Regulation(law.model, *law.stiffness)
+            self._regulation = Regulation(law.model, *gains)
 
     def about(self) -> dict[str, Any]:
         guard = {"threshold": self.threshold, "fallback": self.fallback}

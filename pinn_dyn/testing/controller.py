@@ -69,8 +69,8 @@ class ControllerContract:
 
         shared = row(motion, 3)
         repeated = Motion(*(x.expand_as(q) for x in shared))
-        results = [self.calls(pipeline, q, v, x)[-1].u for x in (shared, repeated)]
-        assert_near(*results, 1e-12)
+        one, other = (self.calls(pipeline, q, v, x)[-1].u for x in (shared, repeated))
+        assert_near(one, other, 1e-12)
 
     def test_a_call_changes_nothing_but_its_result(self, pipeline, at):
         q, v, motion = at

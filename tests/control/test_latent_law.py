@@ -239,9 +239,9 @@ def test_a_part_of_a_period_of_dead_time_takes_a_part_of_two_inputs(model):
 
 def test_a_dead_time_of_the_law_is_that_which_is_set(model):
     law = LatentLaw(model, dead_time=0.06)
-    assert Pipeline(law, 0.01, dead_time=0.02).law.dead_time == 0.06
-    assert Pipeline(LatentLaw(model), 0.01, dead_time=0.02).law.dead_time == 0.02
-    assert Pipeline(LatentLaw(model), 0.01).law.dead_time == 0.0
+    assert Pipeline(law, 0.01, dead_time=0.02).law._late == 0.06
+    assert Pipeline(LatentLaw(model), 0.01, dead_time=0.02).law._late == 0.02
+    assert Pipeline(LatentLaw(model), 0.01).law._late == 0.0
 
 
 def test_the_law_refuses_other_models():

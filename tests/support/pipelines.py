@@ -97,13 +97,13 @@ def cases():
         law.__name__: Case(law(pendulums(), 25.0, 4.0), heavier, 0.01, 10.0)
         for law in (ProportionalDerivative, Regulation, Tracking)
     }
-    settings = {"rate": 5.0, "adapt": ["payload", "friction", "offset"]}
+    settings = {"rate": 2.0, "adapt": ["payload", "friction", "offset"]}
     pid = MotorPID(pendulums(), 0.3, 0.05, 2.0)
     latent = LatentLaw(oscillators(), 0.3, 0.3 * STEP, 0.1 / STEP)
     return laws | {
         "ComputedTorque": Case(ComputedTorque(pendulums(), 50.0, 10.0), heavier, 0.01, 10.0),
         "AdaptiveTracking": Case(
-            AdaptiveTracking(arm, 8.0, 1.0, **settings), SystemPlant(heavy), 0.01, 4.0
+            AdaptiveTracking(arm, 5.0, 0.3, **settings), SystemPlant(heavy), 0.01, 4.0
         ),
         "MotorPID": Case(pid, heavier, 0.01, 0.4),
         "LatentLaw": Case(latent, Oscillators(), STEP, 1.0),
