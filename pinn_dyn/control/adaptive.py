@@ -10,7 +10,7 @@ import torch
 from pydantic import Field, PositiveFloat
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Motion, Step, is_applied
+from pinn_dyn.control.contracts import Motion, Step
 from pinn_dyn.control.laws import Gain, ModelBasedLaw
 from pinn_dyn.mechanics import InputSolver, MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec, spd_solve
@@ -48,8 +48,14 @@ class AdaptiveTracking(ModelBasedLaw):
     Held for a period T: J <- B (1 - X/2)^-1 (1 + X/2) B^T with J = B B^T and X = g T B^T S B, which
     is limited to a norm of 1/2 and keeps J positive.
 
+    At limits of the input, a torque A (u - u_applied) is missing. Then s - sigma replaces s in the
+    laws of adaptation, with the part sigma of s that the missing torque explains (without C)::
+
+        M dsigma/dt + K_D sigma = A (u - u_applied)
+
     Sources: Slotine and Li 1987, "On the adaptive control of robot manipulators"; Lee, Kwon and
-    Park 2018, "A natural adaptive control law for robot manipulators".
+    Park 2018, "A natural adaptive control law for robot manipulators"; Karason and Annaswamy 1994,
+    "Adaptive control in the presence of input constraints".
 
     Args:
         model: a :class:`RigidChain`, or known mechanics on one, in float64.
@@ -101,7 +107,7 @@ class AdaptiveTracking(ModelBasedLaw):
         sizes = {"payload": 10, "friction": n, "offset": n}
         self.sizes = [sizes[part] if part in self.adapt else 0 for part in sizes]
         self.constants_size = sum(self.sizes)
-        self.memory_size = 2 * self.constants_size + model.num_inputs
+        self.memory_size = self.constants_size + model.num_coordinates + model.num_inputs
         super().__init__(
             model, position_gain, velocity_gain, max_condition=max_condition, solver=solver
         )
@@ -109,28 +115,35 @@ class AdaptiveTracking(ModelBasedLaw):
     def step(
         self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
     ) -> Step:
-        """Return u ``(*batch, M)``; the constants adapt over a period whose input was not limited.
-
-        The memory holds the constants of the previous call, those that they become, and u.
-        """
-        size = self.constants_size
-        last, adapted, wanted = memory.split([size, size, self.num_inputs], dim=-1)
-        constants = torch.where(is_applied(wanted, applied), adapted, last)
+        """Return u ``(*batch, M)``; the memory holds the constants, sigma and u."""
+        sizes = [self.constants_size, self.num_coordinates, self.num_inputs]
+        constants, lag, wanted = memory.split(sizes, dim=-1)
         tau = self._torque(q, v, reference, constants)
         u, _, report = self._input(q, v, tau, None, applied, constants)
-        changes = self.changes(q, v, reference, constants)
+        missing = self.model._applied_force(q, v, wanted) - self.model._applied_force(q, v, applied)
+        mass = self.model.mass_matrix(q) / self.period
+        gain = torch.diag_embed(self.velocity_gain.to(q).expand(q.shape))
+        lag = spd_solve(mass + gain, matvec(mass, lag) + missing)
+        changes = self.changes(q, v, reference, constants, lag)
         adapted = self.adapted(constants, changes, self.period)
         if self.sizes[0]:
             report = {**report, "adapted_mass": self._inertia(constants)[..., 3, 3]}
-        return Step(u, torch.cat([constants, adapted, u], dim=-1), report)
+        return Step(u, torch.cat([adapted, lag, u], dim=-1), report)
+
+    def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return the constants of the model, and no torque that is missing."""
+        zero = q.new_zeros(*q.shape[:-1], self.constants_size + self.num_coordinates)
+        return torch.cat([zero, u], dim=-1)
 
     def stiffness(self) -> None:
         """Return None: the position gain is in 1/s."""
 
-    def changes(self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor) -> Tensor:
+    def changes(
+        self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor, lag: Tensor
+    ) -> Tensor:
         """Return the rates of change B^T S B, of log f and of o / b, ``(*batch, R)``."""
         w, rate = self._wanted(q, v, reference)
-        error = w - v
+        error = w - v - lag
         parts = []
         if self.sizes[0]:
             weights = (error.unsqueeze(-1) * self._regressor(q, v, w, rate)).sum(-2)

@@ -143,8 +143,8 @@ class Pipeline(nn.Module):
         changed = (limited != wanted).to(u).sum(-1)
         marks = {**report, "limited": changed > 0, "not_finite": ~is_finite[..., 0]}
         status = torch.zeros_like(changed)
-        for name, mark in marks.items():
-            status = status + STATUS.get(name, 0) * mark.to(u)
+        for name, bit in STATUS.items():
+            status = status + bit * marks[name].to(u) if name in marks else status
         memory = torch.cat([torch.ones_like(started), inputs[..., 1:, :].flatten(-2), memory], -1)
         output = self._dead_time.held_back(inputs) if self._dead_time else limited
         numbers = {name: value.to(u) for name, value in report.items()}

@@ -19,7 +19,7 @@ Function = Callable[[Tensor, Tensor], Tensor]
 _PARTS: ContextVar[dict[str, tuple[Function, Tensor, Tensor]] | None]
 _PARTS = ContextVar("parts", default=None)
 """Repeated functions of the program that is recorded by name, with example arguments."""
-_CALLED: ContextVar[set[str]] = ContextVar("called", default=set())
+_CALLED: ContextVar[frozenset[str]] = ContextVar("called", default=frozenset())
 """Repeated functions that the recorded program calls."""
 
 
@@ -90,9 +90,9 @@ def programs(
         function(*inputs.values())
     result = {}
     for part, (repeated_function, x, row) in reversed(parts.items()):
-        with _set(_CALLED, {*parts} - {part}):
+        with _set(_CALLED, frozenset(parts) - {part}):
             result[part] = trace(repeated_function, {"x": x, "y": row}, ["result"], lines=False)
-    with _set(_CALLED, {*parts}):
+    with _set(_CALLED, frozenset(parts)):
         result[name] = trace(function, inputs, outputs)
     return result
 

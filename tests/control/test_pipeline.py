@@ -11,11 +11,14 @@ from pinn_dyn.control import (
     DisturbanceObserver,
     Guarded,
     Motion,
+    MotorPID,
     Pipeline,
+    PointToPoint,
     PredictiveControl,
     Regulation,
     Stage,
     Step,
+    SystemPlant,
     Tracking,
     export_law,
 )
@@ -23,7 +26,21 @@ from pinn_dyn.mechanics import InputSolver
 from pinn_dyn.systems import TendonArm
 from tests.support.c_code import function_of
 from tests.support.closed_loops import PD
-from tests.support.pipelines import Combination, cases, combinations, compared, pendulums
+from tests.support.linear import Pendulums
+from tests.support.pipelines import (
+    DAMPING,
+    GRAVITY,
+    INPUTS,
+    MASS,
+    REFERENCE,
+    Case,
+    Combination,
+    cases,
+    combinations,
+    compared,
+    limited_and_free,
+    pendulums,
+)
 
 pytestmark = pytest.mark.usefixtures("few_states")
 
@@ -59,6 +76,33 @@ def test_every_combination_gives_the_inputs_of_the_loop_or_is_refused(laws, tmp_
     observed = sum(row["observer"] for row in rows)
     expected = {"PredictiveControl": len(rows), "LatentLaw": observed}
     assert len(refused) == expected.get(law, 0)
+
+
+def stiff_pid():
+    """PID on damped pendulums, from rest at zero to a set point."""
+    model = Pendulums(MASS, GRAVITY, 10 * DAMPING, INPUTS).requires_grad_(False)
+    case = Case(MotorPID(model, 0.5, 0.0, 8.0), SystemPlant(model), PERIOD, 0.0)
+    return case, PointToPoint([0.0, 0.0], [0.5, -0.3], duration=0.1)
+
+
+def observed():
+    law = DisturbanceObserver(Tracking(pendulums(), 25.0, 4.0), 20.0)
+    return Case(law, SystemPlant(pendulums(1.3)), PERIOD, 0.0), REFERENCE
+
+
+def adaptive():
+    return cases()["AdaptiveTracking"], REFERENCE
+
+
+@pytest.mark.parametrize("setting", [observed, adaptive, stiff_pid])
+def test_no_law_winds_up_at_limits(setting):
+    """Within 5 % of the error without limits, or 2 % of the largest, 1 s after limits of 1 s."""
+    case, reference = setting()
+    limited, free = limited_and_free(case, reference, round(1.0 / case.period))
+    late = slice(-round(1.0 / case.period), None)
+    assert limited.max() > 1.2 * free.max() or setting is stiff_pid
+    rms = [np.sqrt(np.mean(x[late] ** 2)) for x in (limited, free)]
+    assert rms[0] < 1.05 * rms[1] + 0.02 * limited.max()
 
 
 # What is a call.

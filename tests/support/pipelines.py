@@ -185,3 +185,29 @@ def compared(combination, case, folder):
         "kB": round(path.stat().st_size / 1000, 1),
         "stopped": record.stopped[0],
     }
+
+
+def limited_and_free(case, reference, periods, share=0.5):
+    """The errors of a loop with limits in its first third, and of a loop without, ``(2, T)``.
+
+    The limits are a share of the largest input without limits in this third. The memory goes on
+    when they end.
+    """
+    free, rows, limit = Pipeline(case.law, case.period), [], None
+    for _ in range(2):
+        tight = free
+        if limit is not None:
+            tight = Pipeline(case.law, case.period, actuator=Actuator(-limit, limit))
+        q = reference(0.0).q[None]
+        v, memory = 0 * q, torch.zeros(1, free.memory_size).double()
+        case.plant.start(q, v)
+        errors, inputs = [], []
+        for k in range(3 * periods):
+            pipeline, motion = (tight if k < periods else free), reference(k * case.period)
+            u, _, memory = pipeline(q, v, *motion, memory)
+            errors.append(float((q - motion.q).norm()))
+            inputs.append(float(u.abs().max()))
+            q, v = case.plant.advance(u, case.period)
+        rows.append(errors)
+        limit = share * max(inputs[:periods])
+    return np.array(rows[::-1])
