@@ -6,6 +6,7 @@ import torch
 
 from pinn_dyn.control import (
     Actuator,
+    AdaptiveTracking,
     ComputedTorque,
     DataRegion,
     DisturbanceObserver,
@@ -23,7 +24,7 @@ from pinn_dyn.control import (
     export_law,
 )
 from pinn_dyn.mechanics import InputSolver
-from pinn_dyn.systems import TendonArm
+from pinn_dyn.systems import RigidChain, TendonArm
 from tests.support.c_code import function_of
 from tests.support.closed_loops import PD
 from tests.support.linear import Pendulums
@@ -33,6 +34,7 @@ from tests.support.pipelines import (
     INPUTS,
     MASS,
     REFERENCE,
+    URDF,
     Case,
     Combination,
     cases,
@@ -91,7 +93,9 @@ def observed():
 
 
 def adaptive():
-    return cases()["AdaptiveTracking"], REFERENCE
+    model = RigidChain(URDF, damping=0.1)
+    law = AdaptiveTracking(model, 8.0, 1.0, rate=20.0, adapt=["payload", "friction"])
+    return Case(law, cases()["AdaptiveTracking"].plant, 0.005, 0.0), REFERENCE
 
 
 @pytest.mark.parametrize("setting", [observed, adaptive, stiff_pid])
