@@ -17,7 +17,7 @@ import torch
 
 from pinn_dyn import evaluation
 from pinn_dyn.data import DataSource
-from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.evaluation.metrics import validation_error
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.identification.constants import (
     CONSTANTS,
@@ -208,7 +208,7 @@ def _write_log(
         for name, value in metrics.items():
             boards[0].add_scalar(name, value, 0)
     for board in boards:
-        error = {"hp/validation_error": metrics[VALIDATION_ERROR]}
+        error = {"hp/validation_error": validation_error(metrics)}
         board.add_hparams(training.compared_settings(), error, run_name=".", global_step=0)
         for name, figure in figures.items():
             board.add_figure(name, figure, 0)
