@@ -11,6 +11,7 @@ import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor, nn
 
+from pinn_dyn.mechanics.arrays import listed
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.known_constants import Constants, Named
 from pinn_dyn.models.scales import Scales
@@ -77,6 +78,7 @@ class Servo(InputMatrix):
         if not scales.prior:
             force = super().typical_force(data.u_rms[-len(index) :]).double()
         spread_of_q = data.q_std[index].double()
+        stiffness, limit = listed(stiffness), listed(limit)
         if stiffness is None and limit not in (None, "learned"):
             stiffness = (torch.as_tensor(limit) / spread_of_q).tolist()  # saturates at that error
         if stiffness is None:
