@@ -185,10 +185,11 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
             f"the model uses {model.input_history} s before its start, but data.history is "
             f"{windows.history} s: set data.history={model.input_history}"
         )
-    if model.past_steps > 20 * windows.steps:
+    steps = len(windows.windows.t) - 1
+    if model.past_steps > 20 * steps:
         log.warning(
             f"the model sees {model.past_steps} steps of {windows.step:g} s before windows of "
-            f"{windows.steps} steps: increase data.stride or data.steps, or reduce model.history"
+            f"{steps} steps: increase data.stride or data.steps, or reduce model.history"
         )
 
 

@@ -271,7 +271,7 @@ def train_network(
     # A missing compiler or device is refused before data are simulated.
     compiled = compiles(compile, length[0], settings)
     if callbacks is None:
-        callbacks = [RolloutFigures(every_n_validations=4)]
+        callbacks = [RolloutFigures()]
     if loggers is None:
         loggers = [tensorboard(folder)]
     count = epochs(*length)

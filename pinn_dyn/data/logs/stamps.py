@@ -11,6 +11,7 @@ import pandas as pd
 from pydantic import PositiveFloat
 from pydantic.dataclasses import dataclass
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.columns import STRICT, UNITS, Columns, PerColumn
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.table import Table
@@ -47,7 +48,7 @@ class Clock(Columns):
         if self.rate is not None:
             self.columns, self.unit = [], []
         elif not self.columns:
-            raise LogError("expected columns, or a rate, as in time: {rate: 100}")
+            raise LogError(f"expected columns, or a rate, as in {_rate()}")
         super().__post_init__()
         self.check_units("time", ["s"])
 
@@ -97,7 +98,7 @@ class Clock(Columns):
         try:
             raw = table.column(name, "time")
         except LogError as error:
-            text = "Without a clock, state the rate in Hz instead, as in time: {rate: 100}"
+            text = f"Without a clock, state the rate in Hz instead, as in {_rate()}"
             raise LogError(f"{error}. {text}") from None
         cells = raw
         if raw.dtype.kind not in "mM":
@@ -151,3 +152,7 @@ def _unwrapped(raw: np.ndarray, factor: float) -> tuple[np.ndarray, list[str]]:
         if wraps.any() and longest < period / 4:
             return turned, [f"the time wraps {wraps.sum()} times and is continued"]
     return raw, []
+
+
+def _rate() -> str:
+    return wording.mapping("time", {"rate": 100})
