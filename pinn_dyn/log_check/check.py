@@ -250,8 +250,9 @@ def _filter(
     if filtered or share < _NOISE or not cutoff < 0.4 / step:
         return []
     reason = f"noise is {100 * share:.2g} % of the steps of q, the motion ends at {highest:.2g} Hz"
-    step_text = wording.step("Butterworth", cutoff=cutoff)
-    return [wording.entry(_key(source, "filter"), step_text, reason)]
+    return [
+        wording.line(_key(source, "filter"), wording.step("Butterworth", cutoff=cutoff), reason)
+    ]
 
 
 def _delay(source: logs.LogSource, delays: Sequence[float]) -> float | list[float] | None:

@@ -98,22 +98,15 @@ class LogCheck:
         options = shlex.join(self.options)
         if self.model == "lnn":
             options = f"model=lnn {options}"
-        if wording.in_python():
-            options = self._builder
+        if not wording.IN_YAML.get():
+            heads = "".join(f", {_HEADS.get(option)}" for option in self.options)
+            options = f"model=functools.partial(pinn_dyn.models.LagrangianNetwork{heads})"
         if self.model == "lnn":
             return f"Options of a training: {options}"
         return (
             "The inputs are positions or pressures of motors, no forces: a soft robot has more "
-            f"modes than coordinates. Options of a training: {options}"
+            f"modes than coordinates. Options of a training: {wording.setting('model', self.model)}"
         )
-
-    @property
-    def _builder(self) -> str:
-        """The model of a training in Python."""
-        if self.model != "lnn":
-            return f"model={self.model!r}"
-        heads = ["pinn_dyn.models.LagrangianNetwork", *(_HEADS[x] for x in self.options)]
-        return f"model=functools.partial({', '.join(heads)})"
 
     @property
     def warnings(self) -> list[str]:
@@ -126,8 +119,7 @@ class LogCheck:
         lines = [f"  {line}" for line in self.steps]
         if self.steps and not self.source.steps:
             lines = [wording.steps(self.steps)]
-        sign = "=" if wording.in_python() else ": "
-        lines += [] if self.delay is None else [f"delay{sign}{self.delay} # s"]
+        lines += [] if self.delay is None else [wording.line("delay", self.delay, "s")]
         return "\n".join(lines)
 
     def table(self) -> pd.DataFrame:

@@ -115,9 +115,7 @@ def test_no_training_is_printed_where_an_angle_turns_too_far_in_a_sample(tmp_pat
 
 def test_only_the_program_changes_in_the_printed_training(monkeypatch):
     monkeypatch.setattr("sys.argv", ["checks/check.py", "dataset=check_1"])
-    command = (
-        "python checks/train.py dataset=check_1 model=lnn data=multi_step model/friction=coulomb"
-    )
+    command = "python checks/train.py dataset=check_1 model=lnn model/friction=coulomb"
     assert _training(["model/friction=coulomb"]) == command
 
 

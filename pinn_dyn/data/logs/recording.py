@@ -30,11 +30,12 @@ def clock_steps(t: np.ndarray) -> str:
     digit = 10 ** (np.floor(np.log10(_LONGEST_GAP * usual)) - 1)
     gap = digit * np.ceil(_LONGEST_GAP * usual / digit)
     gap, rate = float(f"{gap:.3g}"), float(f"{rate:.6g}")
-    steps = [wording.entry("deduplicate", wording.step("Deduplicate"))]
-    steps = steps if (spacing == 0).any() else []
-    steps.append(wording.entry("split_gaps", wording.step("SplitGaps", longest=gap)))
-    steps.append(wording.entry("resample", wording.step("Resample", rate=rate, max_gap=gap)))
-    return f"\n\n{wording.steps(steps)}"
+    lines = [wording.line("deduplicate", wording.step("Deduplicate"))] * int(0 in spacing)
+    lines += [
+        wording.line("split_gaps", wording.step("SplitGaps", longest=gap)),
+        wording.line("resample", wording.step("Resample", rate=rate, max_gap=gap)),
+    ]
+    return f"\n\n{wording.steps(lines)}"
 
 
 @dataclass(frozen=True)

@@ -155,4 +155,4 @@ def _unwrapped(raw: np.ndarray, factor: float) -> tuple[np.ndarray, list[str]]:
 
 
 def _rate() -> str:
-    return wording.mapping("time", {"rate": 100})
+    return wording.entry("time", {"rate": 100})

@@ -56,7 +56,7 @@ def check_clock(
     spacing = np.diff(t)
 
     def rate(value: float) -> str:
-        text = wording.mapping("time", {"rate": float(f"{value:.4g}")})
+        text = wording.entry("time", {"rate": float(f"{value:.4g}")})
         return f"state the rate in Hz instead, as in {text}"
 
     if not (spacing > 0).any():
