@@ -28,8 +28,8 @@ _LOG: dict[str, Any] = {
     "data.steps": 10,
     "data.stride": "about 20 ms",
     "data.batch_size": 128,
-    "trainer.steps": 1000,
-    "trainer.validations": 10,
+    "trainer.steps": 5000,
+    "trainer.validations": 25,
 }
 _COULOMB = {"_target_": "pinn_dyn.models.CoulombFriction", "_partial_": True}
 _MODELS: dict[str, dict[str, Any]] = {

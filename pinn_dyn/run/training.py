@@ -111,6 +111,10 @@ def train(
         data=partial(DynamicsData, steps=10, stride="20 ms", pairs=4000)
         optimizer=partial(torch.optim.AdamW, lr=0.002)
 
+    Arguments that are None depend on the model and on the kind of data. They are those of train.py,
+    see :func:`~.run.defaults.defaults`, also for ``activation`` of a ``NextStateMLP``, ``state`` of
+    a ``HamiltonianNetwork`` and ``friction`` of ``KnownMechanics``.
+
     A folder with an interrupted training of the same data and arguments is resumed, and a finished
     one is loaded. A folder with another training is refused.
 
@@ -121,22 +125,18 @@ def train(
             place.
         loss: builder, called with ``statistics=`` and ``model=``; or ``"increment"`` or
             ``"midpoint"``; None takes the increment loss.
-        optimizer: builder, called with the parameters; or a least-squares fit; None takes AdamW,
-            for oscillators with a higher learning rate and weight decay.
+        optimizer: builder, called with the parameters; or a least-squares fit; None takes AdamW.
         scheduler: builder, called with the optimizer and ``total_steps=``.
-        data: builder of the training windows, called with ``source=``; None takes windows of two
-            steps of about 20 ms from a log (ten for least squares and subnet), and the defaults of
-            :class:`~pinn_dyn.data.DynamicsData` from other sources. Oscillators have 40 steps of
-            about a tenth of a period of the fastest input or motion, fewer on short runs.
+        data: builder of the training windows, called with ``source=``.
         validator: builder of the validation, called with ``training_step=``.
-        steps: steps of the optimizer; None takes 1,000 on a log and 20,000 on other sources.
-        validations: number of validations, a divisor of ``steps``; None takes up to 10 on a log
-            and up to 4 on other sources.
+        steps: steps of the optimizer.
+        validations: number of validations, a divisor of ``steps``.
         seed: seed of the weights and of the order of the windows.
         ensemble: number of models trained at once, with the seeds seed, seed + 1, ...
         compile: compile the dynamics; ``"auto"`` does in long trainings if there is a compiler.
         threads: CPU threads; small networks are fastest with one.
-        trainer: arguments of :class:`lightning.Trainer`, which least squares does not use.
+        trainer: arguments of :class:`lightning.Trainer` beside the defaults; least squares uses
+            none.
         callbacks: callbacks; None draws figures of rollouts if there is a folder.
         loggers: loggers; None writes a TensorBoard log to the folder.
         start_from: a run whose weights the training starts from.

@@ -116,12 +116,12 @@ def test_settings_of_a_caller_are_kept_and_the_others_are_the_defaults(monkeypat
     chain = RigidChain(ARM)
     model = partial(KnownMechanics, structure=chain, friction=NoFriction)
     source = pinn_dyn.dataset("emps")
-    config = of_python(monkeypatch, source, model, steps=14, trainer={"accelerator": "gpu"})
+    config = of_python(monkeypatch, source, model, steps=52, trainer={"accelerator": "gpu"})
     assert config["model"]["friction"]["_target_"] == "pinn_dyn.models.NoFriction"
-    words = ["dataset=emps", "trainer.steps=14", "trainer.accelerator=gpu", "model_name=x"]
+    words = ["dataset=emps", "trainer.steps=52", "trainer.accelerator=gpu", "model_name=x"]
     expected = composed("train", words)["trainer"]
     assert {k: x for k, x in expected.items() if k != "_target_"} == config["trainer"]
-    assert (config["trainer"]["validations"], config["trainer"]["gradient_clip_val"]) == (7, 1.0)
+    assert (config["trainer"]["validations"], config["trainer"]["gradient_clip_val"]) == (13, 1.0)
     model = partial(NextStateMLP, hidden=[8])
     config = of_python(monkeypatch, source, model)
     assert config["model"]["activation"] == "silu"
