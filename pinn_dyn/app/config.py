@@ -39,12 +39,13 @@ OmegaConf.register_new_resolver(
 
 def _default(key: str, kind: str = "", *, _root_: DictConfig) -> Any:
     """Return the default of a key of train.py; ``kind`` is ``log`` for windows as of a log."""
-    names = {x: str(OmegaConf.select(_root_, f"{x}._target_")) for x in ("model", "dataset")}
-    model, source = (path.rpartition(".")[2] for path in names.values())
-    fitted = str(OmegaConf.select(_root_, "optimizer._target_")).endswith(".LeastSquares")
+    parts = [f"{name}._target_" for name in ("model", "dataset", "optimizer")]
+    paths = [str(OmegaConf.select(_root_, part)) for part in parts]
+    model, source, optimizer = (path.rpartition(".")[2] for path in paths)
     on_log = kind == "log" or source == "LogSource"
-    value = defaults(model, on_log=on_log, least_squares=fitted)[key]
-    return even_validations(_root_.trainer.steps, value) if key == "trainer.validations" else value
+    value = defaults(model, on_log=on_log, least_squares=optimizer == "LeastSquares")[key]
+    steps = OmegaConf.select(_root_, "trainer.steps") if key == "trainer.validations" else None
+    return even_validations(steps, value) if isinstance(steps, int) else value
 
 
 OmegaConf.register_new_resolver("default", _default, replace=True)

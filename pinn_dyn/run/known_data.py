@@ -95,9 +95,8 @@ def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
         expected = "rad" if turns else "m"
         if unit not in ("", expected):
             raise ConfigError(
-                f"{column} is in {unit}, expected {expected} for the joint {joint} of {_path()}, "
-                f"which {'turns' if turns else 'slides'}: check the order of the columns, and the "
-                "unit"
+                f"{column} is in {unit}, expected {expected} for the joint {joint}, which "
+                f"{'turns' if turns else 'slides'}: check the order of the columns, and the unit"
             )
     return structure
 
@@ -115,7 +114,7 @@ def _check_order(key: str, columns: Sequence[str], structure: RigidChain) -> Non
         joints = wording.setting("model.structure.joints", guess)
         way = f"name the joints of the columns in their order, as {joints}"
         raise ConfigError(
-            f"{key} has the columns {', '.join(columns)}, and {_path()} the joints "
+            f"{key} has the columns {', '.join(columns)}, and the structure the joints "
             f"{', '.join(names)}: {'leave out columns' if '?' in guess else way}"
         )
     _log_order(key, columns, names)
@@ -124,10 +123,6 @@ def _check_order(key: str, columns: Sequence[str], structure: RigidChain) -> Non
 def _log_order(key: str, columns: Sequence[str], names: Sequence[str]) -> None:
     pairs = map(" -> ".join, zip(columns, names, strict=False))
     log.info("%s, column -> joint by their order: %s", key, "; ".join(pairs))
-
-
-def _path() -> str:
-    return wording.setting("model.structure")
 
 
 def _number(name: str) -> float:

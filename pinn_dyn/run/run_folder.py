@@ -188,9 +188,8 @@ def finish(folder: Path, record: dict[str, Any]) -> dict[str, Any]:
     """
     paths = [folder / CHECKPOINTS / f"{name}.ckpt" for name in ("best", "last")]
     saved = [torch.load(path, map_location="cpu", weights_only=True) for path in paths]
-    kept = saved[0][RECORD]
-    scores = {"validation": kept["validation"], "last_validation": record["validation"]}
-    record = {**record, "kept_step": kept["steps"], **scores}
+    kept = {"kept_step": saved[0]["global_step"], "validation": saved[0][RECORD]["validation"]}
+    record = {**record, "last_validation": record["validation"], **kept}
     for path, content in zip(paths, saved, strict=True):
         save_whole(path, {**content, RECORD: record, FINISHED: True})
     write_whole(folder / METRICS, json.dumps(record, indent=2))

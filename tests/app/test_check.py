@@ -129,7 +129,7 @@ def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):
 
 def test_a_structure_of_another_robot_is_refused_by_name(tmp_path):
     error = fails("check.py", *arguments(tmp_path), *structure("emps"))
-    assert "the columns q1, q2, and model.structure the joints screw" in str(error.code)
+    assert "the columns q1, q2, and the structure the joints screw" in str(error.code)
 
 
 def test_known_kinematics_add_what_the_motion_tells_of_the_bodies(tmp_path, capsys):

@@ -48,7 +48,8 @@ class Clock(Columns):
         if self.rate is not None:
             self.columns, self.unit = [], []
         elif not self.columns:
-            raise LogError(f"expected columns, or a rate, as in {_rate()}")
+            rate = wording.entry("time", {"rate": 100})
+            raise LogError(f"expected columns, or a rate, as in {rate}")
         super().__post_init__()
         self.check_units("time", ["s"])
 
@@ -98,8 +99,9 @@ class Clock(Columns):
         try:
             raw = table.column(name, "time")
         except LogError as error:
-            text = f"Without a clock, state the rate in Hz instead, as in {_rate()}"
-            raise LogError(f"{error}. {text}") from None
+            rate = wording.entry("time", {"rate": 100})
+            text = f"{error}. Without a clock, state the rate in Hz instead, as in {rate}"
+            raise LogError(text) from None
         cells = raw
         if raw.dtype.kind not in "mM":
             numbers = pd.to_numeric(raw, errors="coerce")
@@ -152,7 +154,3 @@ def _unwrapped(raw: np.ndarray, factor: float) -> tuple[np.ndarray, list[str]]:
         if wraps.any() and longest < period / 4:
             return turned, [f"the time wraps {wraps.sum()} times and is continued"]
     return raw, []
-
-
-def _rate() -> str:
-    return wording.entry("time", {"rate": 100})
