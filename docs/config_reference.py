@@ -42,8 +42,8 @@ Made from `conf/` and from the docstrings of the classes that it names, when thi
   `model/damping=constant`.
 - A **key** is changed by its dotted name: `trainer.steps=40000`, `model.mass.hidden=[64,64]`. What
   a class takes besides the keys of its YAML can be given as well: `loss.huber=0.01`.
-- `???` has no default and must be given. `${...}` takes the value of another key, `${default:...}` a
-  default that depends on the model and on the kind of data.
+- `???` has no default and must be given. `${...}` takes the value of another key, `${default:...}`
+  a default that depends on the model and on the kind of data.
 - `_target_` is the class that is built, its arguments are the keys beside it; the rest of what its
   constructor takes (scales of the data, the system) comes from the program.
 - The columns of a data set in the logs are mappings: [CSV logs](csv_logs.md) explains them.
