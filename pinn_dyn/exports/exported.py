@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pinn_dyn.mechanics.arrays import listed
+
 if TYPE_CHECKING:
     from pinn_dyn.exports.program import Program
     from pinn_dyn.mechanics import ContinuousPredictor
@@ -145,7 +147,7 @@ def write(
     module, writer = _WRITERS[path.suffix].split(":")
     path.parent.mkdir(parents=True, exist_ok=True)
     version = importlib.import_module("pinn_dyn").__version__
-    text = json.dumps({"pinn_dyn": version, "real": real, **info})
+    text = json.dumps({"pinn_dyn": version, "real": real, **info}, default=listed)
     # Written beside its place and then moved: a failure leaves the previous file, or none.
     with TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
         partial = Path(folder) / path.name

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,7 @@ from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.external_torque import ExternalTorque
-from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.evaluation.metrics import score
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.exports.exported import Real
@@ -70,7 +69,9 @@ class Run:
         model: the model in float64 and evaluation mode, for tensors.
         statistics: means, spreads and ranges of the training data, and ``step``, the step of the
             training windows, s.
-        metrics: record of the training; ``metrics["validation"]`` has the validation errors.
+        metrics: record of the training; ``metrics["validation"]`` has the validation errors of the
+            model, ``metrics["kept_step"]`` the step at which it was kept, and
+            ``metrics["last_validation"]`` the errors of the last step.
         data: identity of the data, see :func:`~pinn_dyn.data.data_identity`; empty if unknown.
         finished: whether the training has ended.
         covariance: covariance of constants that least squares fitted, ``(P, P)``, or None.
@@ -94,10 +95,9 @@ class Run:
     def __repr__(self) -> str:
         name, data = self.config["model_name"], self.config["dataset"].get("name")
         members = f"{self.model.size} members, " if isinstance(self.model, Ensemble) else ""
-        error = self.metrics.get("validation", {}).get(VALIDATION_ERROR, math.nan)
         return (
             f"Run({name} of {data}: {members}q = ({', '.join(self.labels)}), "
-            f"u = ({', '.join(self.input_labels)}), validation error {error:.3g})"
+            f"u = ({', '.join(self.input_labels)}), validation error {score(self.metrics)})"
         )
 
     @cached_property
