@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from pinn_dyn.control.contracts import Stage
 from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.pipeline import Pipeline
@@ -77,9 +75,9 @@ def export_law(
     model, limits = pipeline.law.model, pipeline.actuator
     info = {
         **pipeline.law.about(),
-        "limits": {key: _listed(getattr(limits, key)) for key in ("low", "high", "rate")},
+        "limits": {key: getattr(limits, key) for key in ("low", "high", "rate")},
         "period": None if pipeline.period != pipeline.period else pipeline.period,
-        "dead_time": _listed(pipeline.dead_time),
+        "dead_time": pipeline.dead_time,
         "reference_ahead": pipeline.ahead[0],
         "num_coordinates": n,
         "num_inputs": pipeline.num_inputs,
@@ -97,7 +95,3 @@ def export_law(
         text += f" q_ref, v_ref and a_ref are the reference {pipeline.ahead[0]:g} s ahead."
     outputs = ("u", "status", "memory_out")
     return write([ExportedFunction("control", pipeline, inputs, outputs, text)], path, info, real)
-
-
-def _listed(value: Any) -> Any:
-    return value.tolist() if isinstance(value, Tensor) else value

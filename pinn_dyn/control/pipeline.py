@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from pinn_dyn.control.contracts import Motion, Setting, Stage, Step
 from pinn_dyn.control.dead_time import DeadTime
 from pinn_dyn.control.effects import Actuator
-from pinn_dyn.exports.c_loop import rows_in_c
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.exports.program import is_traced
 from pinn_dyn.mechanics.arrays import require_last_dim
 
@@ -109,6 +109,8 @@ class Pipeline(nn.Module):
         self.memory_size = sum(self._sizes)
         self.model = law.model if isinstance(law.model, nn.Module) else nn.Module()
         self._shapes: dict[str, torch.Size] = {}
+        roots = self.law, self.actuator, self._dead_time, self.first_input, self.period
+        self._compiled = Compiled(roots)
 
     def forward(
         self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor, memory_in: Tensor
@@ -158,7 +160,7 @@ class Pipeline(nn.Module):
         rows = torch.cat([q, v, *reference, memory_in], dim=-1)
         if not self._shapes:
             self._shapes = {k: x.shape[1:] for k, x in self._columns(rows).items()}
-        result = rows_in_c(self, "pipeline", self._row, rows)(rows)
+        result = self._compiled.rows("pipeline", self._row, rows)
         parts = result.split([x.numel() for x in self._shapes.values()], dim=-1)
         values = {
             name: part.reshape(len(q), *shape)

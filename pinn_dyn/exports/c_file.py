@@ -100,11 +100,16 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     return {x: _call(compiled, x, program, real) for x, program in named.items()}
 
 
-def static_functions(parts: Mapping[str, tuple[Program, CBody]]) -> list[str]:
-    """Return the lines of functions that other functions of a file call, by name."""
+def static_functions(
+    parts: Mapping[str, tuple[Program, CBody]], arguments: Sequence[str] = ()
+) -> list[str]:
+    """Return the lines of functions that other functions of a file call, by name.
+
+    ``arguments`` are declarations of further arguments.
+    """
     code = []
     for name, (program, body) in parts.items():
-        names = [*(f"const real *{x}" for x in program.inputs), "real *result"]
+        names = [*arguments, *(f"const real *{x}" for x in program.inputs), "real *result"]
         unused = [f"(void){x};" for x in program.inputs]
         code += [f"\nstatic void {name}({', '.join(names)})"]
         code += ["{", *(f"  {line}" for line in [*unused, *body.lines]), "}"]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.exports.program import Program, trace
+from pinn_dyn.mechanics.compilation import Wrapped
 from pinn_dyn.mechanics.integrators import Sticking
 
 Function = Callable[[Tensor, Tensor], Tensor]
@@ -33,19 +34,13 @@ def repeated(name: str, function: Function, x: Tensor, rows: Tensor) -> Tensor:
         rows: the rows, the first one first.
     """
     if name in _CALLED.get():
-        return _iterate(name, x.contiguous(), rows.contiguous())
+        return torch.ops.pinn_dyn.iterate(name, x.contiguous(), rows.contiguous())
     parts = _PARTS.get()
     if parts is not None and name not in parts:
         parts[name] = function, x.clone(), rows[..., 0, :].clone()
     for row in rows.unbind(-2):
         x = function(x, row)
     return x
-
-
-@torch.library.custom_op("pinn_dyn::iterate", mutates_args=())
-def _iterate(name: str, x: Tensor, rows: Tensor) -> Tensor:
-    """Stand for the loop over the rows of a function with one result in a program."""
-    return x.clone()
 
 
 def sharing(model: Any) -> Any:
@@ -55,7 +50,7 @@ def sharing(model: Any) -> Any:
     state derivative of another model.
     """
     shared, integrator = copy.copy(model), model.integrator
-    while hasattr(integrator, "inner") and not isinstance(integrator, Sticking):
+    while isinstance(integrator, Wrapped):
         integrator = integrator.inner
     n = model.num_coordinates
 
@@ -91,7 +86,7 @@ def programs(
     result = {}
     for part, (repeated_function, x, row) in reversed(parts.items()):
         with _set(_CALLED, frozenset(parts) - {part}):
-            result[part] = trace(repeated_function, {"x": x, "y": row}, ["result"], lines=False)
+            result[part] = trace(repeated_function, {"x": x, "y": row}, ["result"])
     with _set(_CALLED, frozenset(parts)):
         result[name] = trace(function, inputs, outputs)
     return result

@@ -155,6 +155,21 @@ def test_limits_of_the_rate_count_from_the_first_input():
     assert statuses == (1, 1, 1)
 
 
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_limits_may_be_arrays_and_tensors(tmp_path, kind):
+    limits = {"low": [-1.0, -2.0], "high": [6.5, 2.5], "rate": 700.0}
+    given = {name: kind(value) for name, value in limits.items()}
+    inputs = [
+        list(called(Pipeline(Counting(), PERIOD, actuator=Actuator(**x)), 4))[0]
+        for x in (limits, given)
+    ]
+    assert inputs[0] == inputs[1]
+    assert inputs[0][-1] == [6.5, 2.5]
+    law = Tracking(pendulums(), 3.0, 0.5)
+    path = export_law(law, tmp_path / "law.c", period=PERIOD, actuator=Actuator(**given))
+    assert "limits" in path.with_suffix(".h").read_text()
+
+
 @pytest.mark.parametrize("bad", [[-np.inf, 0.0], [np.inf, -np.inf], [0.0, np.nan]])
 def test_an_input_that_is_not_finite_gives_the_last_whatever_its_sum(bad):
     inputs, statuses, memories = called(Pipeline(Counting({6: bad}), first_input=[0.0, 0.0]), 3)
