@@ -172,8 +172,8 @@ _IS_TRACED: ContextVar[bool] = ContextVar("is_traced", default=False)
 
 
 def is_traced() -> bool:
-    """Return true while :func:`trace` records a function: its operations may not branch."""
-    return _IS_TRACED.get()
+    """Return true while a function is recorded or compiled: its operations may not branch."""
+    return _IS_TRACED.get() or torch.compiler.is_compiling()
 
 
 def trace(
