@@ -311,6 +311,9 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         TypeError: on another robot, if ``data`` is missing, or for ``draws`` without a run.
     """
 
+    action_space: gymnasium.spaces.Box
+    _is_over: np.ndarray
+
     def __init__(
         self,
         robot: Run | ModelPlant | str | Path,
@@ -341,7 +344,8 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         self._starts = setup.q.numpy(), setup.v.numpy()
         self.single_action_space = setup.inputs
         self.single_observation_space = setup.observations(has_goal=reward is None)
-        self.action_space = gymnasium.vector.utils.batch_space(setup.inputs, num_envs)
+        spaces = gymnasium.vector.utils.batch_space(setup.inputs, num_envs)
+        self.action_space = cast(gymnasium.spaces.Box, spaces)
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )
