@@ -18,7 +18,7 @@ import torch
 
 from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.escaping import c_text
-from pinn_dyn.exports.exported import Calls, ExportedFunction, Real, identifier
+from pinn_dyn.exports.exported import DTYPES, Calls, ExportedFunction, Real, identifier
 from pinn_dyn.exports.program import Program
 from pinn_dyn.exports.scalar_code import CBody, c_function
 
@@ -190,7 +190,7 @@ def _pointers(array: str, shapes: Mapping[str, torch.Size]) -> dict[str, str]:
 def _call(
     path: Path, function: str, program: Program, real: Real
 ) -> Callable[..., Sequence[np.ndarray]]:
-    dtype = np.float64 if real == "double" else np.float32
+    dtype = DTYPES[real]
     ends = [*accumulate(map(torch.Size.numel, program.outputs.values()))]
 
     def call(*inputs: np.ndarray) -> Sequence[np.ndarray]:

@@ -30,6 +30,7 @@ Ranges = Mapping[str, tuple[Tensor, Tensor]]
 """Smallest and largest values of inputs by name, for the states of the comparison."""
 
 TOLERANCES = {"double": 1e-9, "float": 1e-4}
+DTYPES = {"double": np.float64, "float": np.float32}
 STATES = 200
 _WRITERS = {
     ".c": "pinn_dyn.exports.c_file:write_c",
@@ -83,15 +84,17 @@ class ExportedFunction:
         with calling_part(self._model, *torch.zeros(2 * n + m).double().split([2 * n, m])) as part:
             return {"part": part, self.name: trace(self.function, example, self.outputs)}
 
-    def compare(self, call: Call, tolerance: float) -> None:
-        """Compare with a function of the file.
+    def compare(self, call: Call, real: Real) -> None:
+        """Compare with a function of the file, whose numbers have the type ``real``.
 
         A difference is relative to the norm of the output at the state, or to the RMS of the norms
         over all states if this is larger.
 
         Raises:
-            RuntimeError: if a difference exceeds the tolerance.
+            RuntimeError: if a difference exceeds the tolerance of the type, the file returns
+                another type, or no value of the original is finite.
         """
+        tolerance = TOLERANCES[real]
         states = [*zip(*self.inputs.values(), strict=True)]
         with torch.no_grad():
             rows = [self.function(*state) for state in states]
@@ -103,6 +106,12 @@ class ExportedFunction:
             values = torch.stack(expected).reshape(len(states), -1).numpy()
             results = np.reshape(column, values.shape)
             finite = np.isfinite(values).all(-1)
+            if results.dtype != DTYPES[real] or not finite.any():
+                raise RuntimeError(
+                    f"{self.name}: {output} has {finite.sum()} finite values of {len(finite)} and "
+                    f"is {results.dtype} in the file, expected {real}: no file is written; check "
+                    "the constants of the model and the writer of this format"
+                )
             norms = np.linalg.norm(values, axis=-1)
             scale = np.fmax(norms, np.sqrt(np.mean(norms[finite] ** 2)) if finite.any() else 0.0)
             error = np.linalg.norm(results - values, axis=-1) / np.where(scale > 0, scale, 1)
@@ -150,7 +159,7 @@ def write(
             functions, partial, text, real
         )
         for function in functions if calls else ():
-            function.compare(calls[function.name], TOLERANCES[real])
+            function.compare(calls[function.name], real)
         for file in (partial.with_suffix(".h"), partial):
             if file.exists():
                 os.replace(file, path.parent / file.name)

@@ -89,7 +89,7 @@ def friction_head(run):
     fitted = pinn_dyn.fit(pd.DataFrame(wave | {"t": t}), **names, model=known, optimizer=solver)
     table = pd.read_csv(fitted.folder / "constants.csv")
     assert table.name.str.startswith("drag of").sum() == 2
-    with pytest.raises(ValueError, match="friction is .*inf.* expected finite numbers"):
+    with pytest.raises(ValueError, match=r"friction is .*inf.* expected finite numbers"):
         fitted.export("arm.xml")
 
 
@@ -142,6 +142,8 @@ def export_target(run):
     model.export("arm.ts", "forward_dynamics")
     q, v, u = torch.rand(3, 3, generator=torch.manual_seed(0)).double()
     (a,) = torch.jit.load("arm.ts")(q, v, u)
+    with pytest.raises(ValueError, match="set real='double'"):
+        model.export("float.ts", "forward_dynamics", real="float")
     torch.testing.assert_close(a, torch.as_tensor(model.forward_dynamics(q, v, u)))
 
 
