@@ -25,11 +25,11 @@ def sampled_models(model: Predictor, covariance: Tensor, count: int, seed: int) 
         J = J_fit + (dJ/dz) e,   c = c_fit + (dc/dz) e,   e ~ N(0, C),   J > 0,   c > 0
 
     The common factor of all masses and forces is drawn in its logarithm instead of e, because data
-    with learned drive gains do not determine it. In directions that the data do not determine, C is the covariance of the prior. So draws keep
-    all forces that the data determine, also where the prior is wide, and every body has a positive
-    density. A hit-and-run sampler draws them: along a random direction, e is normal on the interval
-    of what is possible. Source: Smith 1984, Efficient Monte Carlo procedures for generating points
-    uniformly distributed over bounded regions.
+    with learned drive gains do not determine it. In directions that the data do not determine, C is
+    the covariance of the prior. So draws keep all forces that the data determine, also where the
+    prior is wide, and every body has a positive density. A hit-and-run sampler draws them: along a
+    random direction, e is normal on the interval of what is possible. Source: Smith 1984, Efficient
+    Monte Carlo procedures for generating points uniformly distributed over bounded regions.
 
     Args:
         model: model with the fitted z.

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from pinn_dyn.data.logs import Columns, DelayCurve, Recording, clear_delays
+from pinn_dyn.data.logs import Columns, DelayCurve, LogSource, Recording, clear_delays
 from pinn_dyn.data.logs.check.averages import Averages
 from pinn_dyn.data.logs.check.delay import force_columns
 from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression, Regressor
-from pinn_dyn.data.logs.check.input_faults import delayed
+from pinn_dyn.data.logs.check.input_faults import delayed, input_faults
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.models.structure import Structure
 from pinn_dyn.systems import RigidChain
@@ -48,6 +48,22 @@ def regressor(structure: Structure) -> Regressor:
         return structure.regressor(*map(torch.from_numpy, motion)).numpy()
 
     return function
+
+
+def findings(source: LogSource, structure: Structure) -> list[Measurement]:
+    """Return what contradicts a fit of known mechanics to the log: a part of its check.
+
+    These are drives that saturate, clocks that drift, and a structure that the torques contradict.
+    """
+    inputs = len(source.u.columns)
+    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
+    training = [replace(item, u=item.u[:, :inputs]) for item in training]  # no rates of inputs
+    step = training[0].sample_time("a comparison with the URDF")
+    rigid = regressor(structure) if structure.num_coordinates == inputs else None
+    undelayed = DelayCurve(np.zeros(1), np.zeros(1), 0.0, 0.0, "")
+    faults, _ = input_faults(training, [undelayed] * inputs, source.u, step, rigid)
+    faults += compare_structure(structure, training, (), source.u, step)
+    return [item for item in faults if item.verdict != "ok"]
 
 
 def compare_structure(

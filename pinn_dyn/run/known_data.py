@@ -6,12 +6,12 @@ import logging
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from pinn_dyn.data import DataSource, LogSource
-from pinn_dyn.log_check.structure import compare_structure
+from pinn_dyn.data.logs.check.input_faults import SATURATED
+from pinn_dyn.log_check.structure import findings
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models import KnownMechanics
 from pinn_dyn.run.build import ConfigError, ModelBuilder
@@ -160,17 +160,12 @@ def check_known(model: KnownMechanics, source: DataSource) -> None:
             )
 
 
-def warn_of_structure(model: KnownMechanics, source: DataSource) -> None:
-    """Warn if the URDF of known mechanics contradicts the log, with the likely cause."""
+def warn_of_findings(model: KnownMechanics, source: DataSource) -> None:
+    """Warn of what the check of a log finds against a fit."""
     if not isinstance(source, LogSource) or model.servo:
         return
-    size = len(source.u.columns)
-    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
-    training = [replace(item, u=item.u[:, :size]) for item in training]
-    step = training[0].sample_time("a comparison with the URDF")
-    structure = double_copy(model).structure
-    for item in compare_structure(structure, training, (), source.u, step):
-        if item.verdict != "ok":
+    for item in findings(source, double_copy(model).structure):
+        if item.name != SATURATED or model.limits is None:
             log.warning("%s: %s", source.name, item.text)
 
 

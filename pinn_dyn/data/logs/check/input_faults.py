@@ -14,6 +14,8 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 
+SATURATED = "saturated samples"
+"""Name of the measurement of commands that a drive cannot follow."""
 _LARGEST_DRIFT = 0.05
 _SHIFT = 0.02  # distance of candidates at the end of a run, s
 _LONGEST = 60.0  # s of a run that are used
@@ -81,9 +83,9 @@ def input_faults(
         text = (
             f"input {name!r} is a command that its drive cannot follow: about {level:.2g} {unit} "
             f"act where more is logged ({100 * share:.0f} % of the samples); log the measured "
-            "force, or limit the column to what the drive can do"
+            "force, limit the column to what the drive can do, or give known mechanics its limits"
         )
-        results.append(judged("saturated samples", name, share, "0", saturated, text))
+        results.append(judged(SATURATED, name, share, "0", saturated, text))
         if saturated:
             changed[i] = replace(curves[i], delay=None, reason="the drive saturates")
         drifts_found = drifts_found or drifting
