@@ -117,7 +117,11 @@ def _signature(function: str, program: Program, name: str, real: Real) -> str:
 
 def find_compiler() -> list[str] | None:
     """Return the command of the C compiler, which CC may set with options, or None without one."""
-    commands = [shlex.split(name) for name in _compilers()]
+    try:
+        commands = [shlex.split(name) for name in _compilers()]
+    except ValueError as error:
+        text = f"CC is {os.environ['CC']!r}, expected the command of a C compiler: {error}"
+        raise ValueError(text) from error
     return next((words for words in commands if shutil.which(words[0])), None)
 
 

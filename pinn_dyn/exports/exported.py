@@ -6,6 +6,8 @@ import importlib
 import json
 import os
 import re
+import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -32,6 +34,7 @@ Ranges = Mapping[str, tuple[Tensor, Tensor]]
 TOLERANCES = {"double": 1e-9, "float": 1e-4}
 DTYPES = {"double": np.float64, "float": np.float32}
 STATES = 200
+_TEMPORARY, _DAY = ".export-", 86_400.0  # s
 _WRITERS = {
     ".c": "pinn_dyn.exports.c_file:write_c",
     ".onnx": "pinn_dyn.exports.onnx_file:write_onnx",
@@ -152,8 +155,11 @@ def write(
     path.parent.mkdir(parents=True, exist_ok=True)
     version = importlib.import_module("pinn_dyn").__version__
     text = json.dumps({"pinn_dyn": version, "real": real, **info})
+    for old in path.parent.glob(f"{_TEMPORARY}*"):  # of programs that were killed
+        if time.time() - old.stat().st_mtime > _DAY:
+            shutil.rmtree(old, ignore_errors=True)
     # Written beside its place and then moved: a failure leaves the previous file, or none.
-    with TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
+    with TemporaryDirectory(dir=path.parent, prefix=_TEMPORARY) as folder:
         partial = Path(folder) / path.name
         calls: Calls = getattr(importlib.import_module(module), writer)(
             functions, partial, text, real

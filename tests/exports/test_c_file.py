@@ -2,8 +2,10 @@
 
 import json
 import logging
+import os
 import re
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -125,6 +127,21 @@ def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
     with caplog.at_level(logging.WARNING):
         write([SINE], tmp_path / "f.c", {})
     assert not caplog.text
+
+
+def test_a_compiler_with_an_open_quote_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "gcc -DNAME='a")
+    assert_refused(tmp_path, r"CC is .* expected the command of a C compiler", ValueError)
+
+
+def test_folders_of_exports_that_were_killed_are_removed(tmp_path):
+    """After a day, as another program may still write to a newer one."""
+    for name, age in (("old", 90_000), ("new", 60)):
+        folder = tmp_path / f".export-{name}"
+        folder.mkdir()
+        os.utime(folder, (time.time() - age, time.time() - age))
+    write([SINE], tmp_path / "f.c", {})
+    assert sorted(x.name for x in tmp_path.iterdir()) == [".export-new", "f.c", "f.h"]
 
 
 class Bessel(torch.nn.Module):
