@@ -86,5 +86,5 @@ def _training(options: list[str], with_structure: bool = False) -> str:
     if with_structure:
         options = ["experiment=known", *options]
     elif "experiment=oscillators" not in options:
-        options = ["model=lnn", "data=multi_step", *options]
+        options = ["model=lnn", *options]
     return shlex.join([*parts, *options])

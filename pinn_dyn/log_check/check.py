@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat
 
+from pinn_dyn import wording
 from pinn_dyn.data import logs
 from pinn_dyn.data.bandwidth import bandwidth
 from pinn_dyn.data.logs.check.averages import white_noise
@@ -248,10 +249,9 @@ def _filter(
     filtered = any(isinstance(x, filters) for x in source.steps.values())
     if filtered or share < _NOISE or not cutoff < 0.4 / step:
         return []
-    key = _key(source, "filter")
+    reason = f"noise is {100 * share:.2g} % of the steps of q, the motion ends at {highest:.2g} Hz"
     return [
-        f"{key}: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}} # noise is "
-        f"{100 * share:.2g} % of the steps of q, and the motion ends at {highest:.2g} Hz"
+        wording.line(_key(source, "filter"), wording.step("Butterworth", cutoff=cutoff), reason)
     ]
 
 

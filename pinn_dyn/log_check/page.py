@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from pinn_dyn import wording
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs.check.averages import PARTS, Averages
 from pinn_dyn.data.logs.measurement import Measurement
@@ -34,6 +35,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ROWS = 50  # of a table in the terminal
+_HEADS = {  # of options, in Python
+    "model/input=servo": "input=pinn_dyn.models.Servo",
+    "model/integrator=rosenbrock": "integrator=pinn_dyn.mechanics.Rosenbrock()",
+    "model/friction=coulomb": "friction=pinn_dyn.models.CoulombFriction",
+}
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
 _DRAWN = 1000  # rows of the equation of motion
 _FORCES = (
@@ -91,10 +97,15 @@ class LogCheck:
         """Model and options of a training."""
         options = shlex.join(self.options)
         if self.model == "lnn":
-            return f"Options of a training: model=lnn {options}"
+            options = f"model=lnn {options}"
+        if not wording.IN_YAML.get():
+            heads = "".join(f", {_HEADS.get(option)}" for option in self.options)
+            options = f"model=functools.partial(pinn_dyn.models.LagrangianNetwork{heads})"
+        if self.model == "lnn":
+            return f"Options of a training: {options}"
         return (
             "The inputs are positions or pressures of motors, no forces: a soft robot has more "
-            f"modes than coordinates. Options of a training: {options}"
+            f"modes than coordinates. Options of a training: {wording.setting('model', self.model)}"
         )
 
     @property
@@ -104,10 +115,11 @@ class LogCheck:
 
     @property
     def block(self) -> str:
-        """Entries to append to the YAML of the data set, "" if there are none."""
-        head = ["steps:"] if self.steps and not self.source.steps else []
-        lines = [*head, *(f"  {line}" for line in self.steps)]
-        lines += [] if self.delay is None else [f"delay: {self.delay} # s"]
+        """Entries to append to the data set, "" if there are none."""
+        lines = [f"  {line}" for line in self.steps]
+        if self.steps and not self.source.steps:
+            lines = [wording.steps(self.steps)]
+        lines += [] if self.delay is None else [wording.line("delay", self.delay, "s")]
         return "\n".join(lines)
 
     def table(self) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs import Columns, DelayCurve, LogSource, Recording, clear_delays
 from pinn_dyn.data.logs.check.averages import Averages
 from pinn_dyn.data.logs.check.delay import force_columns
@@ -161,7 +162,8 @@ def _causes(structure: RigidChain, plain: _Cause) -> Iterator[_Cause]:
         columns = "q, v and u" if power > 0 else "q and v"
         text = f"joint {name} turns the other way in the log: reverse its axis, or {columns} of it"
         yield replace(plain, text=text, data=_scaled(data, reversed_k))
-        text = f"a spring at joint {name} explains it: fit it with model.springs=[{name}]"
+        springs = wording.setting("model.springs", [name])
+        text = f"a spring at joint {name} explains it: fit it with {springs}"
         yield replace(plain, text=text, spring=k)
         yield from _offsets(plain, k, name)
         for factor in (*_FACTORS, *(1 / _FACTORS)):
@@ -181,7 +183,8 @@ def _causes(structure: RigidChain, plain: _Cause) -> Iterator[_Cause]:
     for axis in range(3):
         for sign in (1.0, -1.0):
             gravity = [sign * magnitude * (x == axis) for x in range(3)]
-            text = f"the base is mounted otherwise: set model.structure.gravity={gravity}"
+            text = wording.setting("model.structure.gravity", gravity)
+            text = f"the base is mounted otherwise: set {text}"
             yield replace(plain, text=text, rigid=regressor(structure.with_gravity(gravity)))
 
 

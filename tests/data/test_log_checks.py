@@ -8,6 +8,7 @@ import pytest
 import yaml
 from hydra.utils import instantiate
 
+import pinn_dyn
 from pinn_dyn.data.logs import (
     Deduplicate,
     LogError,
@@ -162,18 +163,20 @@ CLOCKS = {
 }
 
 
-def suggested(error):
+def suggested(error, language):
     """The steps of the block at the end of a message."""
     _, block = str(error.value).split("\n\n")
+    if language == "python":
+        return eval(f"dict({block}\n)", {"pinn_dyn": pinn_dyn})["cleaning"]
     return instantiate(yaml.safe_load(block)["steps"], _convert_="all")
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
-def test_the_suggested_steps_load_the_log_that_they_were_suggested_for(tmp_path, clock):
+def test_the_suggested_steps_load_the_log_that_they_were_suggested_for(tmp_path, clock, language):
     write(tmp_path, CLOCKS[clock](np.random.default_rng(0)))
     with pytest.raises(LogError) as error:
         source(tmp_path).load()
-    steps = suggested(error)
+    steps = suggested(error, language)
     splits = source(tmp_path, steps=steps).load()
     assert sum(len(x.t) for x in splits.train) > 450
     assert splits.train[0].t[1] == pytest.approx(0.01)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 
@@ -18,7 +19,7 @@ _CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
 
 
 def clock_steps(t: np.ndarray) -> str:
-    """Return the block ``steps`` in YAML that gives a run of times ``(T,)`` in s a uniform clock.
+    """Return the steps that give a run of times ``(T,)`` in s a uniform clock.
 
     The rate is round, near the usual one. SplitGaps leaves no gap that Resample would refuse.
     """
@@ -28,13 +29,13 @@ def clock_steps(t: np.ndarray) -> str:
     rate = min((decade * x for x in _ROUND), key=lambda x: abs(np.log(x * usual)))
     digit = 10 ** (np.floor(np.log10(_LONGEST_GAP * usual)) - 1)
     gap = digit * np.ceil(_LONGEST_GAP * usual / digit)
-    name = "_target_: pinn_dyn.data.logs"
-    steps = [f"deduplicate: {{{name}.Deduplicate}}"] if (spacing == 0).any() else []
-    steps += [
-        f"split_gaps: {{{name}.SplitGaps, longest: {gap:.3g}}}",
-        f"resample: {{{name}.Resample, rate: {rate:.6g}, max_gap: {gap:.3g}}}",
+    gap, rate = float(f"{gap:.3g}"), float(f"{rate:.6g}")
+    lines = [wording.line("deduplicate", wording.step("Deduplicate"))] * int(0 in spacing)
+    lines += [
+        wording.line("split_gaps", wording.step("SplitGaps", longest=gap)),
+        wording.line("resample", wording.step("Resample", rate=rate, max_gap=gap)),
     ]
-    return "\n  ".join(["\n\nsteps:", *steps])
+    return f"\n\n{wording.steps(lines)}"
 
 
 @dataclass(frozen=True)

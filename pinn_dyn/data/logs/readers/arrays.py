@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.readers.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional, vector_columns
@@ -227,7 +228,8 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
         if name in scalars and name == request.time:
             columns[name] = scalars[name] * np.arange(samples)
             if _RATE.search(name):
-                problem = f"{name} is a rate: write time: {{rate: {scalars[name]}}}."
+                setting = wording.entry("time", {"rate": scalars[name]})
+                problem = f"{name} is a rate: write {setting}."
         elif name not in columns and base:
             problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
             problem += f"real numbers in {samples} rows."
@@ -236,7 +238,7 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
             run = next((f", write {x!r}, and so on." for x in runs if "*" in x), ".")
             problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or run} "
             rate = next((y for x, y in scalars.items() if _RATE.search(x)), 100)
-            problem += f"Without a clock write time: {{rate: {rate}}}, in Hz."
+            problem += f"Without a clock write {wording.entry('time', {'rate': rate})}, in Hz."
         if problem:
             raise LogError(f"{path}: {problem} The file has {listed(sizes)}")
     table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
