@@ -19,6 +19,7 @@ from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.c_draws import LoopOfDraws
 from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.exports.compiled import Function
+from pinn_dyn.exports.watch import Watch
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.run.run import Run
@@ -44,7 +45,8 @@ _SAMPLES = 200  # states per trajectory
 class ModelPlant(Plant):
     """K copies of a learned robot, integrated as in its training; inputs are zero before the start.
 
-    A loop in C is used as soon as it pays off, see :class:`~pinn_dyn.exports.c_loop.CLoop`.
+    A loop in C is used as soon as it pays off, see :class:`~pinn_dyn.exports.c_loop.CLoop`. Changes
+    of the model count from the next start on.
 
     Args:
         model: the learned system.
@@ -65,13 +67,22 @@ class ModelPlant(Plant):
         threads: PositiveInt = 1,
     ):
         self.num_coordinates, self.num_inputs = model.num_coordinates, model.num_inputs
-        self._models = [model_for_rollouts(x) for x in draws or [model]]
-        self._model, self._step, self._threads = self._models[0], step, threads
+        self._originals = [*(draws or [model])]
+        self._step, self._threads = step, threads
         self._delay = torch.zeros(model.num_inputs) if delay is None else delay
+        self._copy()
+
+    def _copy(self) -> None:
+        """Copy the models with their present numbers and attributes."""
+        self._watch = Watch(*self._originals)
+        self._models = [model_for_rollouts(x) for x in self._originals]
+        self._model = self._models[0]
         self._loop: Function | None = None
         self._has_draws_in_c = True
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
+        if self._watch.changed():
+            self._copy()
         self._x = self._states(q0, v0, torch.ones(len(q0)).bool())
         self._inputs = [q0.new_zeros(len(q0), self.num_inputs)]
         self._loop = self._ready()
