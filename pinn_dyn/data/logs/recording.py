@@ -24,8 +24,7 @@ def clock_steps(t: np.ndarray) -> str:
     """
     spacing = np.diff(t)
     usual = float(np.median(spacing[spacing > 0]))
-    decade = 10 ** np.floor(-np.log10(usual))
-    rate = min((decade * x for x in _ROUND), key=lambda x: abs(np.log(x * usual)))
+    rate = round_rate(usual)
     digit = 10 ** (np.floor(np.log10(_LONGEST_GAP * usual)) - 1)
     gap = digit * np.ceil(_LONGEST_GAP * usual / digit)
     name = "_target_: pinn_dyn.data.logs"
@@ -35,6 +34,12 @@ def clock_steps(t: np.ndarray) -> str:
         f"resample: {{{name}.Resample, rate: {rate:.6g}, max_gap: {gap:.3g}}}",
     ]
     return "\n  ".join(["\n\nsteps:", *steps])
+
+
+def round_rate(sample_time: float) -> float:
+    """Return a round rate in Hz near that of a sample time, s."""
+    decade = 10 ** np.floor(-np.log10(sample_time))
+    return min((float(decade * x) for x in _ROUND), key=lambda x: abs(np.log(x * sample_time)))
 
 
 @dataclass(frozen=True)
