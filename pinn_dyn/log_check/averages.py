@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pinn_dyn.data.logs import Recording
 
@@ -21,7 +22,7 @@ _TRIED = 4  # widths
 _NOISE, _QUIET = 0.01, 3e-4  # largest parts of the variance of the acceleration that are noise
 _FEW = 3  # inputs up to which their products are terms too
 _MOST, _PART = 200_000, 20.0  # rows of a log that is checked as a whole; s of a part of others
-_ROWS = 8_000  # largest number of rows of the regression
+_ROWS = 3_000  # largest number of rows of the regression
 _SPACING = 0.25  # smallest distance of rows in widths
 _INDEPENDENT = 3.5  # widths at which the averages of two rows are independent
 _SHORT = 0.005  # width of the kernel of the sign of v, s
@@ -32,6 +33,10 @@ _RESTING = 0.1  # largest weight of samples at rest in an average
 _LARGE = 10.0  # acceleration over the usual one from which a row counts less
 # The kernel is this polynomial times a Gaussian: its moments from 1 to 5 are zero.
 _FLAT = np.polynomial.Polynomial([15, 0, -10, 0, 1]) / 8
+
+
+Signs = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Smooth sign of v, that of slow v ``(T, 2N)``, and 1 for samples at rest."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Averages:
         stretch: number of the recording, ``(R,)``.
         passed: time since the beginning of the run, ``(R,)``, s.
         since, left: time since the first and to the last average of the inputs, ``(R,)``, s.
-        noise: part of the variance of a that is noise, ``(N,)``.
+        noise: largest part of the variance of a that is noise, of joints that move.
         spread: standard deviation of the inputs before averaging, ``(M,)``.
         step: sample time, s.
         recordings: the recordings.
@@ -76,20 +81,27 @@ class Averages:
     passed: np.ndarray
     since: np.ndarray
     left: np.ndarray
-    noise: np.ndarray
+    noise: float
     spread: np.ndarray
     step: float
     recordings: Sequence[Recording]
     inputs: Mapping[int, tuple[np.ndarray, np.ndarray]]
 
     @classmethod
-    def of(cls, recordings: Sequence[Recording], step: float, width: float) -> Averages | None:
+    def of(
+        cls,
+        recordings: Sequence[Recording],
+        step: float,
+        width: float,
+        friction: Sequence[Signs] | None = None,
+    ) -> Averages | None:
         """Return the averages with a kernel of a width in s; None if there are too few rows.
 
         Args:
             recordings: stretches of one sample time, in the order of their runs.
             step: sample time, s.
             width: standard deviation of the kernel, s, at least 1.5 samples.
+            friction: signs of v of each recording; None computes them.
         """
         samples = max(width / step, 1.5)
         edge = int(np.ceil(CUT * samples))
@@ -103,18 +115,18 @@ class Averages:
             rows = np.arange(edge, len(item) - edge, stride)
             if len(rows) < 2:
                 continue
-            sign, slow_sign, still = signs(item.q, step)
+            sign, slow_sign, still = signs(item.q, step) if friction is None else friction[k]
             t = item.t[edge:-edge]
             u = averages(item.u, samples)[edge:-edge]
             part = {
                 "t": item.t[rows],
-                "q": averages(item.q, samples)[rows],
-                "v": averages(item.q, samples, step, order=1)[rows],
-                "a": averages(item.q, samples, step, order=2)[rows],
-                "u": u[rows - edge],
-                "sign": averages(sign, samples)[rows],
-                "slow_sign": averages(slow_sign, samples)[rows],
-                "moving": averages(still, samples)[rows] < _RESTING,
+                "q": _at_rows(item.q, samples, stride),
+                "v": _at_rows(item.q, samples, stride, 1) / step,
+                "a": _at_rows(item.q, samples, stride, 2) / step**2,
+                "u": u[::stride],
+                "sign": _at_rows(sign, samples, stride),
+                "slow_sign": _at_rows(slow_sign, samples, stride),
+                "moving": _at_rows(still, samples, stride) < _RESTING,
                 "run": np.full(len(rows), names.index(item.run)),
                 "stretch": np.full(len(rows), k),
                 "passed": item.t[rows] - starts[item.run],
@@ -129,12 +141,13 @@ class Averages:
         joined: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
         white = np.max([noise(item.q) for item in recordings], axis=0) / step**2
         variance = joined["a"].var(axis=0).clip(min=1e-300)
+        moving = joined["moving"].mean(axis=0) > _RESTING
         share = (kernel(samples, 2) ** 2).sum() * white**2 / variance
         spread = np.concatenate([item.u for item in recordings]).std(axis=0).clip(min=1e-300)
         return cls(
             width=samples * step,
             step=step,
-            noise=share,
+            noise=float(share[moving].max(initial=0.0)),
             spread=spread,
             recordings=recordings,
             inputs=inputs,
@@ -206,14 +219,15 @@ def averages_of_widths(recordings: Sequence[Recording], step: float) -> list[Ave
     are too short.
     """
     results: list[Averages] = []
+    friction = [signs(item.q, step) for item in recordings]
     for width in sorted({max(width, 1.5 * step) for width in _WIDTHS}):
-        data = Averages.of(recordings, step, width)
+        data = Averages.of(recordings, step, width, friction)
         if data is None:
             break
-        if data.noise.max() > _NOISE:
+        if data.noise > _NOISE or (results and results[0].noise > _NOISE):
             results = []
         results.append(data)
-        if len(results) == _TRIED and results[0].noise.max() < _NOISE:
+        if len(results) == _TRIED:
             break
     return results
 
@@ -223,7 +237,7 @@ def compared(widths: Sequence[Averages]) -> tuple[int, int]:
 
     A verdict holds if it is the same with both.
     """
-    smooth = (k for k, data in enumerate(widths) if data.noise.max() < _QUIET)
+    smooth = (k for k, data in enumerate(widths) if data.noise < _QUIET)
     first = next(smooth, len(widths) - 1)
     return first, first + 1 if first + 1 < len(widths) else max(first - 1, 0)
 
@@ -232,6 +246,13 @@ def averages(x: np.ndarray, samples: float, step: float = 1.0, order: int = 0) -
     """Return averages of x by the kernel of a width in samples, or their slopes of an order."""
     weights = kernel(samples, order) / step**order
     return np.asarray(scipy.ndimage.convolve1d(x, weights, axis=0, mode="nearest"))
+
+
+def _at_rows(x: np.ndarray, samples: float, stride: int, order: int = 0) -> np.ndarray:
+    """Return averages of x, or their slopes per sample, at every ``stride``-th row."""
+    weights = kernel(samples, order)[::-1]
+    parts = sliding_window_view(x, len(weights), axis=0)[::stride]
+    return np.asarray(np.einsum("rkt,t->rk", parts, weights))
 
 
 @cache
@@ -262,8 +283,8 @@ def noise(x: np.ndarray) -> np.ndarray:
     return np.maximum(white_noise(x), np.where(np.isfinite(smallest), smallest, 0) / np.sqrt(12))
 
 
-def signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the smooth sign of v, that of slow v ``(T, 2N)``, and 1 for samples at rest."""
+def signs(q: np.ndarray, step: float) -> Signs:
+    """Return the signs of the speed of coordinates ``(T, N)``."""
     samples = max(_SHORT / step, 1.5)
     v = scipy.ndimage.gaussian_filter1d(q, samples, axis=0, order=1) / step
     # Deviation of the derivative of white noise that a Gaussian kernel averages.

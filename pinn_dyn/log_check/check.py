@@ -40,7 +40,7 @@ from pinn_dyn.log_check.runs import (
     equations_of_motion,
 )
 from pinn_dyn.log_check.stored import store, stored
-from pinn_dyn.log_check.structure import compare_structure, regressor
+from pinn_dyn.log_check.structure import FIT, SCALE, compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure
 
@@ -56,6 +56,7 @@ _LIMITS = (
     ("noise / range", _NOISE, "its noise is {:.2g} % of its range"),
     ("test outside", _OUTSIDE, "{:.3g} % of the test is outside the training range"),
 )
+_WRONG = "the robot of the URDF has other forces"  # reason why there is no delay
 _judged = partial(judged, section="docs/bags_and_other_logs.md#is-the-log-good-enough")
 
 
@@ -184,22 +185,30 @@ def _answers(
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else clear_delays(curves, step)
     late = [widths[k].delayed(clear) for k in chosen]
+    data = [x.rows(x.stretch < len(first)) for x in late]
+    of_robot = [] if structure is None else compare_structure(structure, data, source.u)
+    wrong = {x.place for x in of_robot if x.name == FIT and x.verdict != "ok"}
+    if wrong and structure is not None:
+        # A wrong robot has wrong delays.
+        pairs = zip(curves, structure.joint_names, strict=True)
+        curves = [x.without(_WRONG) if j in wrong and x.of_bodies else x for x, j in pairs]
+        clear = [0.0] * inputs if servo else clear_delays(curves, step)
+        late = [widths[k].delayed(clear) for k in chosen]
     width = max(data.width for data in late)
     motions = [equations_of_motion(data, source.q, source.u, width, rigid) for data in late]
     # A fault of an input or of the clock explains runs that differ, and signs.
     of_clock = [x for x in source.measurements if x.name == LOST]
     if all(x.verdict == "ok" for x in [*faults, *of_clock]):
-        results += check_runs(motions[0], motions[1], names, inputs <= size)
-        results += check_signs(motions[0], source.u, curves, rigid)
+        results += check_runs(motions, names, inverse=inputs <= size, exact=not wrong)
+        if not any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok"):
+            results += check_signs(motions[0], source.u, curves, rigid)
     results += faults
     free = [False] * size if structure is None else _free(structure)
     results += check_angles(late[0], source.q, free)
     if source.v is not None:
         results += check_velocity_lag(everything, source.q, source.v, step, late[0].width)
-    data = [x.rows(x.stretch < len(first)) for x in late]
     results += _inputs_measured(source, data[0], curves, clear)
-    if structure is not None:
-        results += compare_structure(structure, data, source.u)
+    results += of_robot
     driven = [driven_joint(data[0], i) for i in range(inputs)] if 0 < inputs < size else []
     return _Answers(results, curves, clear, held, motions[0], driven)
 

@@ -71,6 +71,15 @@ class DelayCurve:
     friction_spread: float = np.nan
 
     @property
+    def of_bodies(self) -> bool:
+        """True if the equation is that of rigid bodies."""
+        return self.form == _RIGID
+
+    def without(self, reason: str) -> DelayCurve:
+        """Return the curve without a delay, for a reason."""
+        return replace(self, delay=None, reason=reason)
+
+    @property
     def dry(self) -> bool:
         """True if the joint clearly has dry friction."""
         return self.friction > max(_FRICTION, 3 * self.friction_spread)
@@ -128,10 +137,10 @@ def input_delays(
     for i in range(inputs):
         signals = [item.u[:, i] for item in recordings]
         if not any(np.ptp(x) for x in signals):
-            curves[i] = replace(curves[i], delay=None, reason="the input is constant")
+            curves[i] = curves[i].without("the input is constant")
         elif all(_is_sine(x) for x in signals):
             reason = "the input is a single sine, whose delay looks like damping"
-            curves[i] = replace(curves[i], delay=None, reason=reason)
+            curves[i] = curves[i].without(reason)
     return curves
 
 

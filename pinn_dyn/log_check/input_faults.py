@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -123,10 +123,10 @@ def input_faults(
         results.append(judged(HELD, name, rows, "1", held[i] > 1, text))
         reasons = {"the drive saturates": share > 0, "the input is held": held[i] > 1}
         for reason in (text for text, holds in reasons.items() if holds):
-            changed[i] = replace(curves[i], delay=None, reason=reason)
+            changed[i] = curves[i].without(reason)
         if drift:
             reason = "the clock of the inputs drifts"
-            changed = [replace(x, delay=None, reason=x.reason or reason) for x in changed]
+            changed = [x.without(x.reason or reason) for x in changed]
     return results, changed, held
 
 

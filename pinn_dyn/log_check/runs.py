@@ -43,6 +43,7 @@ _UNKNOWN_WINDOWS = 4  # odd windows of a run from which an unknown cause is name
 _CLEAR = 0.9  # correlation from which a scale is clear
 _SCALES = (0.55, 1.8)  # of another load; beyond, another unit
 _NOTICEABLE = 0.05  # share of a force from which its inertial part is judged
+_SIGN_ROWS = 600  # from which the sign of an input is judged
 _FORCES = {"Nm", "N", "A"}  # units of inputs that push their joint forward
 
 
@@ -54,7 +55,8 @@ class Equation:
         columns: columns of y and X by name, ``(R, .)``.
         x: names of the columns of X.
         labels: names of the K columns of y.
-        regression: sums over the windows.
+        window: number of the window of each row, ``(R,)``.
+        theta: coefficients, ``(P, K)``.
         weights: weights of the windows, ``(1, B)``, small where they disagree with the others.
         offset: constant that was subtracted from the forces, ``(K,)``.
         row_weights: weights of the rows, ``(R, 1)``, small at jumps of q.
@@ -66,7 +68,8 @@ class Equation:
     columns: dict[str, np.ndarray]
     x: list[str]
     labels: Sequence[str]
-    regression: EquationOfMotionRegression
+    window: np.ndarray
+    theta: np.ndarray
     weights: np.ndarray
     offset: np.ndarray
     row_weights: np.ndarray
@@ -80,12 +83,11 @@ class Equation:
         The share is that of the median window if that window has a larger signal. At rest dry
         friction may hold any force up to its level, which does not count.
         """
-        fit = self.regression.fit("y", self.x, self.weights if weights is None else weights)
-        left = np.abs(self.columns["y"] - self._terms() @ fit.theta[0])
+        theta = self.theta if weights is None else self._fitted(weights)
+        left = np.abs(self.columns["y"] - self._terms() @ theta)
         if self.resting is not None:
-            level = np.abs(self._terms()[:, self.friction]).max(axis=0) @ np.abs(
-                fit.theta[0][self.friction]
-            )
+            signs = np.abs(self._terms()[:, self.friction]).max(axis=0)
+            level = signs @ np.abs(theta[self.friction])
             left = np.where(self.resting[:, None], (left - level).clip(min=0), left)
         means, signal = (self._means(x) for x in (left, self.columns["y"]))
         usual = np.maximum(np.median(signal, axis=0), 1e-9 * signal.max(axis=0))
@@ -93,25 +95,29 @@ class Equation:
 
     def moving_windows(self) -> np.ndarray:
         """Return the windows in which the joint moves most of the time, ``(B,)``; all if none."""
-        block = self.regression.block
         if self.resting is None:
-            return np.ones(block.max() + 1, dtype=bool)
-        moving = np.bincount(block, ~self.resting) > np.bincount(block) / 2
+            return np.ones(self.window.max() + 1, dtype=bool)
+        moving = np.bincount(self.window, ~self.resting) > np.bincount(self.window) / 2
         return moving if moving.any() else ~moving
 
     def _means(self, x: np.ndarray) -> np.ndarray:
         """Return the root mean squares of columns in each window, ``(B, K)``."""
-        block = self.regression.block
-        squares = [np.bincount(block, column) for column in (self.row_weights * x**2).T]
-        return np.sqrt(np.transpose(squares) / np.bincount(block)[:, None])
+        squares = [np.bincount(self.window, column) for column in (self.row_weights * x**2).T]
+        return np.sqrt(np.transpose(squares) / np.bincount(self.window)[:, None])
+
+    def _fitted(self, weights: np.ndarray) -> np.ndarray:
+        """Return coefficients for other weights of the windows, ``(1, B)``."""
+        rows = self.row_weights * np.sqrt(weights[0][self.window])[:, None]
+        rows = rows if self.resting is None else rows * ~self.resting[:, None]
+        regression = EquationOfMotionRegression(self.columns, 0 * self.window, rows)
+        return np.asarray(regression.fit("y", self.x).theta[0])
 
     def _terms(self) -> np.ndarray:
         return np.hstack([self.columns[name] for name in self.x])
 
     def predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Return y and X theta, ``(R, K)`` each."""
-        fit = self.regression.fit("y", self.x, self.weights)
-        return self.columns["y"], self._terms() @ fit.theta[0]
+        return self.columns["y"], self._terms() @ self.theta
 
 
 @dataclass(frozen=True)
@@ -220,12 +226,25 @@ def _equation(
     base = regression.spreads(totals).clip(min=1).max(axis=1) ** -2.0
     weights = regression.robust_weights("y", list(x), base)
     return Equation(
-        columns, list(x), labels, regression, weights, offset, row_weights, False, resting, friction
+        columns=columns,
+        x=list(x),
+        labels=labels,
+        window=regression.block,
+        theta=regression.fit("y", list(x), weights).theta[0],
+        weights=weights,
+        offset=offset,
+        row_weights=row_weights,
+        resting=resting,
+        friction=friction,
     )
 
 
 def check_runs(
-    narrow: Motion | None, wide: Motion | None, names: Sequence[str], inverse: bool
+    motions: Sequence[Motion | None],
+    names: Sequence[str],
+    *,
+    inverse: bool,
+    exact: bool = True,
 ) -> list[Measurement]:
     """Compare the windows of each run with the equation of the others.
 
@@ -233,18 +252,18 @@ def check_runs(
     includes its run, and if it does not grow with the width of the kernel.
 
     Args:
-        narrow, wide: equations with kernels of two widths.
+        motions: equations with kernels of two widths; None if the rows are too few.
         names: names of the runs.
         inverse: the equations are those of forces.
+        exact: the equations are not known to be wrong; else windows without a cause do not count.
     """
+    narrow, wide = motions
     if narrow is None or wide is None:
         return []
     labels = [label for x in narrow.equations for label in x.labels]
-    numbers = narrow.equations[0].regression.numbers
-    shared = np.isin(numbers, wide.equations[0].regression.numbers)
+    numbers, of_wide = np.unique(narrow.window), np.unique(wide.window)
     residual, smooth = narrow.residual(), np.full((len(numbers), len(labels)), np.inf)
-    of_wide = np.isin(wide.equations[0].regression.numbers, numbers)
-    smooth[shared] = wide.residual()[of_wide]
+    smooth[np.isin(numbers, of_wide)] = wide.residual()[np.isin(of_wide, numbers)]
     parts = (x.moving_windows() for x in narrow.equations)
     usual = np.hstack(
         [
@@ -253,7 +272,7 @@ def check_runs(
         ]
     ).clip(min=1e-3)
     odd = (residual > _RATIO * usual) & (residual > _RESIDUAL) & (smooth < _OF_WIDTH * residual)
-    rows = narrow.equations[0].regression.block
+    rows = narrow.equations[0].window
     runs = narrow.data.run[np.unique(rows, return_index=True)[1]]  # of each window
     expected = f"below {_RATIO:g}"
     results = []
@@ -270,13 +289,13 @@ def check_runs(
         j = int(ratios.max(axis=0).argmax())
         cause = _cause(narrow, bad[:, j][rows], j, labels, inverse)
         times = narrow.data.t[bad.any(axis=1)[rows]]
-        if not cause and bad.any(axis=1).sum() < _UNKNOWN_WINDOWS:
+        if not cause and (bad.any(axis=1).sum() < _UNKNOWN_WINDOWS or not exact):
             continue  # a generic equation is no exact one
         text = (
-            f"run {names[k]} does not fit the other runs from {times[0]:.4g} to {times[-1]:.4g} s: "
-            f"the residual of {labels[j]!r} is {ratios[:, j].max():.3g} times that of the median "
-            f"window; {cause or _UNKNOWN} Correct or leave out this part: all numbers of the check "
-            "include it"
+            f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
+            f"{times[-1]:.4g} s: the residual of {labels[j]!r} is {ratios[:, j].max():.3g} times "
+            f"that of the median window; {cause or _UNKNOWN} Correct or leave out this part: all "
+            "numbers of the check include it"
         )
         results.append(judged(RESIDUAL, names[k], ratios.max(), expected, True, text))
     largest = float((residual / usual).max())
@@ -318,8 +337,7 @@ def _cause(motion: Motion, rows: np.ndarray, j: int, labels: Sequence[str], inve
             return f"the motion is that without input: {idle} do not act there, is the drive off?"
     else:
         x = motion.equations[0]
-        theta = x.regression.fit("y", x.x, x.weights).theta[0]
-        effect = x.columns["inputs"][rows] @ theta[-x.columns["inputs"].shape[1] :]
+        effect = x.columns["inputs"][rows] @ x.theta[-x.columns["inputs"].shape[1] :]
         measured, predicted = effect, measured - predicted + effect
         name = f"the effect of the inputs on {labels[j]!r}"
     # The mean of a torque in another unit is far from that of the other runs.
@@ -355,27 +373,27 @@ def check_signs(
         return []
     data, n = motion.data, motion.data.q.shape[1]
     directions, square = np.eye(n), n == len(u.columns)
+    few = np.arange(len(data)) % max(1, len(data) // _SIGN_ROWS) == 0
     results = []
     for i, (name, equation) in enumerate(zip(u.columns, motion.equations, strict=True)):
-        regression = equation.regression
-        weights = equation.weights[0, regression.block]
-        power = data.u[:, [i]] * data.v
+        weights = equation.weights[0, equation.window][few]
+        power = (data.u[:, [i]] * data.v)[few]
         shares = (weights @ power) / (weights @ np.abs(power)).clip(min=1e-300)
         k = i if square else driven_joint(data, i)
-        driven, columns = data, equation.columns
+        driven, columns, theta = data, equation.columns, equation.theta[:, 0]
         if not square:  # The accelerations of passive joints follow from that of the driven joint.
             driven = replace(data, a=directions[k] * data.a)
             columns = {**force_columns(driven, i, None), "y": columns["y"]}
             regression = EquationOfMotionRegression(columns, motion.window, data.row_weights())
-        fit = regression.fit("y", equation.x, equation.weights)
-        x = np.hstack([columns[key] for key in equation.x])
-        moved = replace(driven, a=driven.a + directions[k])
+            theta = regression.fit("y", equation.x, equation.weights).theta[0, :, 0]
+        x = np.hstack([columns[key][few] for key in equation.x])
+        moved = driven.rows(few)
+        moved = replace(moved, a=moved.a + directions[k])
         pushed = force_columns(moved, i, bodies(moved, rigid if equation.of_bodies else None))
-        change = np.hstack([pushed[key] for key in equation.x]) - x
-        inertia = change @ fit.theta[0, :, 0]
-        left = columns["y"][:, 0] - x @ fit.theta[0, :, 0]
+        inertia = (np.hstack([pushed[key] for key in equation.x]) - x) @ theta
+        left = columns["y"][few, 0] - x @ theta
         smallest = max(2 * np.std(left), _NOTICEABLE * np.std(columns["y"]))
-        clear = np.std(inertia * data.a[:, k]) > smallest
+        clear = np.std(inertia * data.a[few, k]) > smallest
         positive = weights @ (inertia > 0) / weights.sum()
         bad = bool(clear and positive < 0.1 and shares[k] < 0.2)
         curve = curves[i] if curves and square else None

@@ -36,9 +36,12 @@ _UNKNOWN = (
     "explains it; check the kinematics (lengths, axes, order of the joints) and the columns"
 )
 _ROWS = 1500  # of the comparison
-_FEW = 400  # that the causes are tried on
+_FEW, _BEST = 300, 5  # rows that causes are tried on; causes that are judged on held-out data
+_TRIED = 3  # inputs with the largest residuals that causes have to explain
+_WHITE = 0.8  # residual with a wide kernel over that with a narrow one, of noise
 _ANGLES = np.linspace(-np.pi, np.pi, 12, endpoint=False)  # rad, of homing offsets
 _FACTORS = np.array([2.0, 3.0, 4.0, 5.0, 6.0, 10.0])  # of gears, and their inverses
+_CHUNK = 500  # rows of a call of a regressor, for its memory
 _SCALE = 2.5  # of torques over those of the URDF's bodies
 _CERTAIN = 0.1  # largest standard error of a scale, as a share of it
 
@@ -64,7 +67,9 @@ def regressor(structure: Structure) -> Regressor:
     """Return the regressor of a structure on NumPy arrays."""
 
     def function(*motion: np.ndarray) -> np.ndarray:
-        return structure.regressor(*map(torch.from_numpy, motion)).numpy()
+        parts = zip(*(np.array_split(x, len(x) // _CHUNK + 1) for x in motion), strict=True)
+        bodies = [structure.regressor(*map(torch.from_numpy, part)).numpy() for part in parts]
+        return np.concatenate(bodies)
 
     return function
 
@@ -111,9 +116,14 @@ def compare_structure(
     trials = [(data, rigid(data.q, data.v, data.a)) for data in thinned]
     rows = [i for i in range(len(u.columns)) if thinned[0].moving[:, i].sum() >= FEWEST]
     fits = {i: [_fit(data, bodies, i) for data, bodies in trials] for i in rows}
-    suspects = [i for i, pair in fits.items() if all(fit.suspect for fit in pair)]
-    bad = {i for i in suspects if all(fit.worse for fit in fits[i])}
-    hint = _explanation(structure, thinned[0], suspects) if suspects else ""
+    suspects = [
+        i
+        for i, (narrow, wide) in fits.items()
+        if wide.left > _WHITE * narrow.left or (narrow.suspect and wide.suspect)
+    ]
+    bad = {i for i, pair in fits.items() if all(fit.worse and fit.suspect for fit in pair)}
+    worst = sorted(suspects, key=lambda i: -fits[i][0].left)[:_TRIED]
+    hint = _explanation(structure, thinned[0], worst) if worst else ""
     if hint:
         bad = set(suspects)
     results = []
@@ -164,6 +174,19 @@ def _judged(
 
 
 def _left(cause: _Cause, joints: Sequence[int]) -> float:
+    """Return the sum of the shares of inputs that rigid bodies leave, per degree of freedom."""
+    shares = []
+    for i in joints:
+        rows = cause.data.moving[:, i]
+        data = cause.data.rows(rows)
+        columns = force_columns(data, i, cause.bodies[rows])
+        if cause.extra is not None and cause.extra[0] == i:
+            columns["extra"] = cause.extra[1][rows].reshape(len(data), -1)
+        shares.append(unexplained(data, data.u[:, [i]], *columns.values()))
+    return float(np.sum(shares))
+
+
+def _left_of_held_out(cause: _Cause, joints: Sequence[int]) -> float:
     """Return the sum of the shares of inputs that rigid bodies leave of held-out data."""
     shares = []
     for i in joints:
@@ -177,9 +200,10 @@ def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -
     """Return the causes that leave least of the inputs, in words; "" if none leaves much less."""
     data = data.thinned(_FEW)
     plain = _Cause("", data, regressor(structure)(data.q, data.v, data.a))
-    causes = list(_causes(structure, plain, joints))
-    totals = np.array([_left(cause, joints) for cause in causes])
-    if not totals.min() < _EXPLAINS * _left(plain, joints):
+    causes = sorted(_causes(structure, plain, joints), key=lambda cause: _left(cause, joints))
+    causes = causes[:_BEST]
+    totals = np.array([_left_of_held_out(cause, joints) for cause in causes])
+    if not totals.min() < _EXPLAINS * _left_of_held_out(plain, joints):
         return ""
     # In a plane, the mirror image of a reversed joint is the other joint reversed.
     ties = np.flatnonzero(totals < max(_TIE * totals.min(), 1e-6))
