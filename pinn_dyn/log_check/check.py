@@ -181,7 +181,7 @@ def _answers(
     if not widths:
         return _Answers(results, curves, [0.0] * inputs, [1] * inputs)
     chosen = compared(widths)
-    faults, curves, held = input_faults(of_training[chosen[0]], curves, source.u, rigid)
+    faults, curves, held = input_faults([of_training[k] for k in chosen], curves, source.u, rigid)
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else clear_delays(curves, step)
     late = [widths[k].delayed(clear) for k in chosen]

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from pinn_dyn.data.logs import Recording
 from pinn_dyn.log_check.averages import Averages, averages_of_widths, with_products
@@ -269,6 +270,8 @@ def _curve(
     residual, best = shares[0], int(shares[0].argmin())
     minima = np.array([minimum(candidates, share) for share in shares[1:]])
     spread = float(np.sqrt((len(minima) - 1) * minima.var()))
+    # Few parts leave the spread uncertain.
+    spread *= float(scipy.stats.t.ppf(0.975, len(minima) - 1)) / INTERVAL
     reason = ""
     if residual[best] > _UNEXPLAINED:
         reason = f"the equation leaves {100 * residual[best]:.0f} % unexplained at any delay"

@@ -14,6 +14,7 @@ Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 GROUPS = 10
 """Parts of the data that a jackknife leaves out in turn."""
 _RIDGE = 1e-9
+_RICH = 3  # independent rows at least for a term of a rich equation
 _MOST = 400  # terms, for the time that a regression takes
 _ITERATIONS = 7  # of reweighted least squares
 
@@ -159,7 +160,7 @@ def terms(data: Averages, form: str) -> np.ndarray:
             (trig[:, :, None] * x[:, None, :]).reshape(len(x), -1) for x in [*inertial, trig[:, 1:]]
         ]
         count = sum(x.shape[1] for x in products)
-        rich = 12 * count < len(q) and count < _MOST
+        rich = _RICH * count < data.independent_rows() and count < _MOST
         parts += products if rich else inertial
     return np.hstack(parts)
 
@@ -194,5 +195,11 @@ def bodies(data: Averages, rigid: Regressor | None) -> np.ndarray | None:
 
 
 def tenths(data: Averages) -> np.ndarray:
-    """Return the number of the tenth of the rows that a row belongs to, ``(R,)``."""
-    return np.arange(len(data)) * GROUPS // len(data)
+    """Return the number of the tenth of the rows that a row belongs to, ``(R,)``.
+
+    Parts of less than a second depend on each other: short logs have fewer parts, at least three.
+    """
+    inside = np.diff(data.stretch) == 0
+    seconds = np.diff(data.t)[inside].clip(max=0.1).sum()
+    groups = int(np.clip(seconds, 3, GROUPS))
+    return np.arange(len(data)) * groups // len(data)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,10 +53,23 @@ class _Trial:
 
 
 def input_faults(
-    data: Averages,
+    widths: Sequence[Averages],
     curves: Sequence[DelayCurve],
     u: Columns,
     rigid: Regressor | None = None,
+) -> tuple[list[Measurement], list[DelayCurve], list[int]]:
+    """Look for faults of inputs that kernels of two widths agree on, see :func:`_faults`."""
+    results, changed, held = _faults(widths[0], curves, u, rigid)
+    if all(x.verdict == "ok" for x in results):
+        return results, changed, held
+    again, _, _ = _faults(widths[1], curves, u, rigid)
+    if [x.verdict for x in results] == [x.verdict for x in again]:
+        return results, changed, held
+    return [replace(x, verdict="ok", text="") for x in results], list(curves), [1] * len(curves)
+
+
+def _faults(
+    data: Averages, curves: Sequence[DelayCurve], u: Columns, rigid: Regressor | None
 ) -> tuple[list[Measurement], list[DelayCurve], list[int]]:
     """Look for inputs whose clock drifts, whose drive saturates, or that are held for rows.
 
@@ -183,6 +196,7 @@ def _saturation(trial: _Trial, i: int, best: float) -> tuple[float, float]:
         if follows_limit:
             ratios[k] = ratio
     k = int(ratios.argmin())
-    if not ratios[k] < _LESS or trial.shares(limited)[k] > _CLEAR:
+    # The lowest level is the edge of the candidates.
+    if k == 0 or not ratios[k] < _LESS or trial.shares(limited)[k] > _CLEAR:
         return np.inf, 0.0
     return float(levels[k]), float((np.abs(signals) > levels[k]).mean())

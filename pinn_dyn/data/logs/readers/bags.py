@@ -32,7 +32,7 @@ def read_bag(path: Path, request: Request) -> Table:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
-    description = [6, str(path.absolute()), stats, fields, request.max_age]
+    description = [7, str(path.absolute()), stats, fields, request.max_age]
 
     def decode() -> dict[str, np.ndarray]:
         notes: list[str] = []
@@ -125,11 +125,15 @@ def _topic(
         if field.isdigit() and len(joined) > 1:
             turns = f"is of {listed(joined)} by turns"
             raise LogError(f"{path}: {column!r} {turns}: write {column[: -len(field)]}{joined[0]}")
+    publishers, orders = _publishers(publishers, joints)
     usual = pd.Series(publishers[~foreign]).mode()[0]
     for reason, mask in (
         ("with stamp 0", zero),
         (f"of {listed(sorted(set().union(*joints[foreign])))}", foreign),
-        ("of another publisher", ~foreign & (publishers != usual)),
+        (
+            f"of another publisher{orders}, record without it,",
+            ~foreign & ~zero & (publishers != usual),
+        ),
     ):
         if mask.any():
             notes.append(f"{mask.sum()} of {len(rows)} messages of {topic} {reason} are dropped")
@@ -143,6 +147,22 @@ def _topic(
                 f"{topic}, and the bag does not record which. Stop or remap one, and record again"
             )
     return frame
+
+
+def _publishers(publishers: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return numbers of the publishers of messages, and the orders of joints that tell them apart.
+
+    Nodes that share a connection are told apart by the order of the joints, if it changes to and
+    fro.
+    """
+    orders = list(dict.fromkeys(x for x in joints if x))
+    numbers = np.array([orders.index(x) if x else 0 for x in joints])
+    same = len({frozenset(x) for x in orders}) == 1 < len(orders)
+    if not same or np.count_nonzero(np.diff(numbers)) < _FEW:
+        return publishers, ""
+    counts = np.bincount(numbers)
+    texts = [f"{count} of {', '.join(x)}" for x, count in zip(orders, counts, strict=True)]
+    return publishers * len(orders) + numbers, f" ({' and '.join(texts)})"
 
 
 def _merged(topics: Sequence[pd.DataFrame], last: str) -> pd.DataFrame:
