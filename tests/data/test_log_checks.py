@@ -96,7 +96,7 @@ BAD = {
     "repeat": (clock(repeat), r"line 402, column 't': the time repeats from 3.99.*Deduplicate"),
     "jump": (clock(lambda t: np.where(t > 3, t + 1, t)), r"line 303.*from 3 to 4.01.*SplitGaps"),
     "jitter": (clock(lambda t: t + 0.004 * np.sin(40 * t)), r"needs a uniform clock.*Resample"),
-    "bursts": (in_bursts(), r"line 3, column 't': .* repeats .*RowClock \(rate: .*, longest: "),
+    "bursts": (in_bursts(), r"line 3, column 't': .* repeats .*RowClock, rate: .*, longest: "),
     "empty": (motion()[:0], r"has no rows"),
     "short": (motion(2.0), r"too short to keep 2.0 s for test"),
     "wraps": (wrapped(2 * np.pi), r"run.csv, line \d+, column 'q2' \(q\): the angle wraps from"),

@@ -14,6 +14,7 @@ from pinn_dyn.data.logs.measurement import Measurement
 SIGNALS: tuple[Literal["q", "v", "u"], ...] = ("q", "v", "u")
 _ROUND = (1, 2, 2.5, 4, 5, 8, 10)  # rates of which usual pieces are a multiple
 _LONGEST_GAP = 10  # sample times that are interpolated
+_GAP_BURSTS, _MANY = 3, 5000  # usual bursts in a gap; rows of which one in a thousand is a burst
 _CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
 
 
@@ -34,6 +35,29 @@ def clock_steps(t: np.ndarray) -> str:
         f"resample: {{{name}.Resample, rate: {rate:.6g}, max_gap: {gap:.3g}}}",
     ]
     return "\n  ".join(["\n\nsteps:", *steps])
+
+
+def burst_steps(t: np.ndarray) -> dict[str, str]:
+    """Return the steps in YAML that repair stamps in bursts, ``(T,)`` in s, by their names.
+
+    The rate is that of the rows between gaps, which are longer than usual bursts; it is round if
+    the stamps allow it.
+    """
+    spacing = np.diff(t)
+    burst = float(np.quantile(spacing, 0.999 if len(t) > _MANY else 0.95))
+    inside = (spacing >= 0) & (spacing <= _GAP_BURSTS * burst)
+    written = np.cumsum(np.where(inside, spacing, burst))
+    rows = np.arange(len(written))
+    rate = 1 / float(np.polyfit(rows, written, 1)[0])
+    rounded = float(f"{rate:.3g}")
+    distance = written - rows / rounded
+    rate = rounded if np.ptp(distance) < 3 * burst else rate
+    name = "_target_: pinn_dyn.data.logs"
+    steps = {"row_clock": f"{{{name}.RowClock, rate: {rate:.7g}, longest: {2 * burst:.2g}}}"}
+    if not inside.all():
+        gap = _GAP_BURSTS * burst
+        return {"split_gaps": f"{{{name}.SplitGaps, longest: {gap:.2g}}}", **steps}
+    return steps
 
 
 def round_rate(sample_time: float) -> float:

@@ -222,7 +222,10 @@ class LogSource(DataSource):
             self.validation, self.test, self.guard = default_split(
                 times, self.seed, float(self.input_delay.max(initial=0.0))
             )
-        parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
+        lead = float(np.max(self.delay))
+        parts = split(
+            recordings, self.validation, self.test, guard=self.guard, seed=self.seed, lead=lead
+        )
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
         pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
         limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
