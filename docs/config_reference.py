@@ -19,6 +19,7 @@ import griffe
 import yaml
 
 from pinn_dyn.app.settings import SETTINGS
+from pinn_dyn.run.defaults import defaults
 from pinn_dyn.run.validation import arguments_model
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,21 +42,38 @@ Made from `conf/` and from the docstrings of the classes that it names, when thi
   `model/damping=constant`.
 - A **key** is changed by its dotted name: `trainer.steps=40000`, `model.mass.hidden=[64,64]`. What
   a class takes besides the keys of its YAML can be given as well: `loss.huber=0.01`.
-- `???` has no default and must be given. `${...}` takes the value of another key.
+- `???` has no default and must be given. `${...}` takes the value of another key, `${default:...}`
+  a default that depends on the model and on the kind of data.
 - `_target_` is the class that is built, its arguments are the keys beside it; the rest of what its
   constructor takes (scales of the data, the system) comes from the program.
 - The columns of a data set in the logs are mappings: [CSV logs](csv_logs.md) explains them.
 
-`python train.py --cfg job` prints the configuration that a command line makes, `--help` the groups
-and examples.
+`python train.py --cfg job --resolve` prints the configuration that a command line makes, `--help`
+the groups and examples.
+
+## Defaults of a training
+
+The command line and `pinn_dyn.train` have the same. `data=multi_step` takes those of a log for
+simulated data.
+
+| key | simulated data | log | exceptions |
+|---|---|---|---|
 """
+KINDS = {"simulated data": False, "log": True}
+MODELS = {
+    "hnn": "HamiltonianNetwork",
+    "known": "KnownMechanics",
+    "mlp": "NextStateMLP",
+    "subnet": "SubspaceEncoder",
+    "oscillators": "CoupledOscillators",
+}
 
 
 def config_reference() -> str:
     """The whole page, Markdown."""
     logging.getLogger("griffe").setLevel(logging.CRITICAL)
     package = griffe.load("pinn_dyn", search_paths=[str(ROOT)])
-    parts = [HEAD, "## Programs"]
+    parts = [HEAD + "\n".join(_training_defaults()), "\n## Programs"]
     for name in PROGRAMS:
         own = CONF / name / f"{name}.yaml"
         path = own if own.is_file() else CONF / f"{name}.yaml"
@@ -81,6 +99,31 @@ def config_reference() -> str:
             parts.append(f"| `{name}` | {_cell(_comment(path.read_text().splitlines()))} |")
         parts.append("")
     return "\n".join(parts)
+
+
+def _training_defaults() -> list[str]:
+    """A row for each default of a training, with the models that have another one."""
+    usual = {kind: defaults("", on_log=on_log) for kind, on_log in KINDS.items()}
+    special: dict[str, list[str]] = {key: [] for key in usual["log"]}
+    cases = {f"`{name}`": (target, False) for name, target in MODELS.items()}
+    for name, (model, fitted) in {**cases, "least squares": ("", True)}.items():
+        for kind, on_log in KINDS.items():
+            values = defaults(model, on_log=on_log, least_squares=fitted)
+            for key, value in values.items():
+                if key not in usual[kind] or value != usual[kind][key]:
+                    text = f"{name}, {kind}: {_plain(value)}"
+                    special.setdefault(key, []).append(text)
+    rows = []
+    for key, texts in special.items():
+        both = [_plain(values.get(key)) for values in usual.values()]
+        rows.append(f"| `{key}` | {both[0]} | {both[1]} | {'; '.join(texts)} |")
+    return rows
+
+
+def _plain(value) -> str:
+    if isinstance(value, dict):
+        value = value["_target_"].rpartition(".")[2]
+    return "–" if value is None else f"{value}"
 
 
 def _option(package, path: Path, title: str, prefix: str, level: int, types=None) -> str:

@@ -1,10 +1,12 @@
 """Settings for all tests."""
 
 import gc
+from contextlib import nullcontext
 
 import pytest
 import torch
 
+from pinn_dyn.wording import command_line
 from tests.support.compositions import keep_compositions
 
 gc.disable()  # until all is imported
@@ -51,6 +53,13 @@ def _figures_without_layout():
         engine = "matplotlib.layout_engine.ConstrainedLayoutEngine.execute"
         patch.setattr(engine, lambda *_: None)
         yield
+
+
+@pytest.fixture(params=["python", "yaml"])
+def language(request):
+    """What the reader of messages writes: both are followed."""
+    with command_line() if request.param == "yaml" else nullcontext():
+        yield request.param
 
 
 @pytest.fixture

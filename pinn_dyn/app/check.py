@@ -98,6 +98,4 @@ def _training(options: Sequence[str], with_structure: bool = False) -> str:
     parts.insert(parts[:1] == ["python"], str(name))
     if not any(x.startswith("dataset=") for x in parts):
         parts.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
-    if "model=lnn" in options:
-        options = ["model=lnn", "data=multi_step", *(x for x in options if x != "model=lnn")]
     return shlex.join([*parts, *options])

@@ -19,6 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from pinn_dyn import wording
 from pinn_dyn.app.config import completed, composed, config_folder, explained
 from pinn_dyn.app.sweep import write_error
 from pinn_dyn.run.program import hush
@@ -67,7 +68,8 @@ def _run(command: str, cfg: DictConfig) -> object:
     module = importlib.import_module(f"pinn_dyn.app.{command}")
     task = getattr(module, "main", None) or getattr(module, command)
     try:
-        return task(cfg)
+        with wording.command_line():
+            return task(cfg)
     except (ConfigError, NonFiniteLossError, SimulationError) as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise  # SweepCallback goes on with the other jobs

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.settings import SETTINGS
+from pinn_dyn.run.defaults import defaults, even_validations
 from pinn_dyn.run.validation import ConfigError, check_arguments, check_keys, check_value
 from pinn_dyn.spelling import did_you_mean
 
@@ -34,6 +35,20 @@ OmegaConf.register_new_resolver(
     lambda name, run: name or "/".join(Path(run).absolute().parts[-2:]),
     replace=True,
 )
+
+
+def _default(key: str, kind: str = "", *, _root_: DictConfig) -> Any:
+    """Return the default of a key of train.py; ``kind`` is ``log`` for windows as of a log."""
+    parts = [f"{name}._target_" for name in ("model", "dataset", "optimizer")]
+    paths = [str(OmegaConf.select(_root_, part)) for part in parts]
+    model, source, optimizer = (path.rpartition(".")[2] for path in paths)
+    on_log = kind == "log" or source == "LogSource"
+    value = defaults(model, on_log=on_log, least_squares=optimizer == "LeastSquares")[key]
+    steps = OmegaConf.select(_root_, "trainer.steps") if key == "trainer.validations" else None
+    return even_validations(steps, value) if isinstance(steps, int) else value
+
+
+OmegaConf.register_new_resolver("default", _default, replace=True)
 
 
 def config_folder(command: str) -> Path:

@@ -22,8 +22,10 @@ from pinn_dyn.run.run_folder import CONFIG, METRICS
 from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.whole import read_regular
 
-_RECORDED = ("training_seconds", "steps", "pairs", "parameters")
-_SHOWN = ("val/error_mean", "val/diverged", "test/error_mean", "test/diverged", "training_seconds")
+_RECORDED = ("training_seconds", "steps", "kept_step", "pairs", "parameters")
+_SPLITS = ("val", "last", "test")  # the kept model on validation data, the last one, on test data
+_SHOWN = [f"{split}/{name}" for split in _SPLITS for name in ("error_mean", "diverged")]
+_SHOWN += ["kept_step", "training_seconds"]
 _TEST = ("error_mean", "error_median", "error_worst", "diverged")
 
 
@@ -44,6 +46,8 @@ def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[s
             row = {"folder": str(folder), "seed": config["seed"]}
             row |= {key: record[key] for key in _RECORDED if key in record}
             row |= {k: x for k, x in record["validation"].items() if k.startswith("val/")}
+            last = record.get("last_validation", {}).items()
+            row |= {f"last/{k[4:]}": x for k, x in last if k.startswith("val/")}
             rows.append(row)
             configs.append(config)
         except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import signal
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
 from pinn_dyn.app.sweep import resume_command
-from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.evaluation.metrics import validation_error
 from pinn_dyn.run import training
 from pinn_dyn.run.build import ConfigError, build_part, build_source, model_builder
 from pinn_dyn.run.run_folder import (
@@ -34,7 +33,7 @@ _RESUME = ("resume=", "trust=")
 
 
 def train(cfg: DictConfig) -> float:
-    """Train one model; return the validation error, which a sweep minimizes.
+    """Train one model; return the validation error of the kept model, which a sweep minimizes.
 
     A folder that holds this training is not trained again: a finished training is loaded, an
     interrupted one is resumed.
@@ -74,7 +73,7 @@ def train(cfg: DictConfig) -> float:
         write_whole(folder / "payload.csv", load.to_csv(index=False, float_format="%.4g"))
         text = load.to_string(index=False, na_rep="", float_format="{:.4g}".format)
         print(f"Load in the frame of {load.attrs['frame']}, inertia about its center:\n{text}")
-    return run.metrics["validation"].get(VALIDATION_ERROR, math.nan)
+    return validation_error(run.metrics["validation"])
 
 
 def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:

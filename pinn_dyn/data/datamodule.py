@@ -15,6 +15,8 @@ from pinn_dyn.data.windows import Windows, draw_windows
 from pinn_dyn.mechanics import samples_of
 from pinn_dyn.models.statistics import Statistics
 
+_LONGEST_WINDOW = 40  # steps, of steps="auto"
+
 log = logging.getLogger(__name__)
 
 
@@ -25,10 +27,11 @@ class DynamicsData:
         source: the source of the trajectories.
         pairs: number of training windows, or ``"all"`` windows of the trajectories, which are also
             used if there are fewer.
-        steps: steps H of a window; 1 gives the paper's transition pairs.
-        stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``.
-            ``"auto"`` is about a tenth of a period of the fastest input, or of the fastest motion
-            if that is slower.
+        steps: steps H of a window; 1 gives the paper's transition pairs. ``"auto"`` is 40, or half
+            of the longest trajectory if that is shorter.
+        stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``, or
+            ``"about 20 ms"``, which is rounded to whole samples. ``"auto"`` is about a tenth of a
+            period of the fastest input, or of the fastest motion if that is slower.
         batch_size: windows in a batch.
         batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.
@@ -42,7 +45,7 @@ class DynamicsData:
         source: DataSource,
         *,
         pairs: PositiveInt | Literal["all"] = 8000,
-        steps: PositiveInt = 1,
+        steps: PositiveInt | Literal["auto"] = 1,
         stride: PositiveInt | str = 10,
         batch_size: PositiveInt = 256,
         batches_per_epoch: PositiveInt,
@@ -75,9 +78,19 @@ class DynamicsData:
             log.info("data.stride=auto is %.4g ms", 1e3 * count * sample_time)
             return count
         if isinstance(self.stride, str):
-            length = seconds_of("stride", self.stride, "'auto', ")
-            return samples_of("stride", length, self.splits.train[0].t)
+            t = self.splits.train[0].t
+            length = seconds_of("stride", self.stride.removeprefix("about "), "'auto', ")
+            if self.stride.startswith("about "):
+                return max(1, round(length / float(t[1] - t[0])))
+            return samples_of("stride", length, t)
         return self.stride
+
+    @property
+    def _window_steps(self) -> int:
+        if self.steps != "auto":
+            return self.steps
+        longest = max(item.duration for item in self.splits.train)
+        return max(1, min(_LONGEST_WINDOW, int(longest / 2 / self.step)))
 
     @functools.cached_property
     def windows(self) -> Windows:
@@ -87,14 +100,15 @@ class DynamicsData:
             ValueError: on a batch larger than the number of windows.
         """
         runs, stride, count = self.splits.train, self._samples, self.pairs
-        starts = sum(max(len(x.t) - self.steps * stride, 0) for x in runs)
+        steps = self._window_steps
+        starts = sum(max(len(x.t) - steps * stride, 0) for x in runs)
         if count != "all" and 0 < starts < count:
             log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)
             count, self.batch_size = starts, min(self.batch_size, starts)
         windows = draw_windows(
             runs,
             count=None if count == "all" else count,
-            steps=self.steps,
+            steps=steps,
             stride=stride,
             seed=self.seed,
             coverage=self.coverage,

@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +20,31 @@ VALIDATION_ERROR = "val/error_mean"
 """Metric that summarizes a training; sweeps minimize it."""
 BEST_BY = "val/error_windowed"
 """Metric that chooses the best checkpoint. A long rollout may err least before it learns."""
+
+
+def validation_error(metrics: Mapping[str, float]) -> float:
+    """Return the error that sweeps minimize: infinite if a rollout diverged, NaN if unknown."""
+    if metrics.get("val/diverged", 0) > 0:
+        return math.inf
+    return metrics.get(VALIDATION_ERROR, math.nan)
+
+
+def error_text(metrics: Mapping[str, float]) -> str:
+    """Return the validation error as text, or the number of rollouts that diverged."""
+    if diverged := metrics.get("val/diverged", 0):
+        return f"{diverged:g} diverged"
+    return f"{validation_error(metrics):.3g}"
+
+
+def score(record: Mapping[str, Any]) -> str:
+    """Return the validation error of a training as text, and the step whose model is kept."""
+    text = error_text(record.get("validation", {}))
+    if "kept_step" not in record or record["steps"] == 1:  # a fit of constants
+        return text
+    text += " (kept: step {kept_step} of {steps}".format(**record)
+    if record["kept_step"] < record["steps"]:
+        text += f"; last: {error_text(record['last_validation'])}"
+    return f"{text})"
 
 
 @dataclass(frozen=True)

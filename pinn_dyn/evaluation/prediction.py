@@ -23,7 +23,6 @@ from pinn_dyn.mechanics import (
     double_copy,
     samples_of,
 )
-from pinn_dyn.mechanics.compilation import RecordedSteps
 from pinn_dyn.models.subspace_encoder import EncodedPredictor
 
 Model = TypeVar("Model", bound=Predictor)
@@ -128,14 +127,14 @@ def predict_trajectories(
 def model_for_rollouts(
     model: Model, device: torch.device | str = "cpu", threads: PositiveInt = 1
 ) -> Model:
-    """Copy the model in float64, with loops in C (on a GPU recorded steps) for long rollouts."""
+    """Copy the model in float64, with loops in C for long rollouts on a CPU."""
     copy = double_copy(model, device)
     members, inner = (1, copy.stack) if isinstance(copy, Ensemble) else (0, copy)
-    if isinstance(inner, ContinuousPredictor) and torch.device(device).type == "cuda":
-        inner.integrator = RecordedSteps(inner.integrator)
-    elif isinstance(inner, ContinuousPredictor):
+    if torch.device(device).type != "cpu":
+        return copy
+    if isinstance(inner, ContinuousPredictor):
         inner.integrator = CLoop(inner.integrator, members, threads)
-    elif isinstance(inner, EncodedPredictor) and torch.device(device).type == "cpu":
+    elif isinstance(inner, EncodedPredictor):
         LatentLoop(inner, threads).install()
     return copy
 

@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from torch import Tensor
+
+from pinn_dyn.mechanics.arrays import listed
 
 if TYPE_CHECKING:
     from pinn_dyn.exports.program import Program
@@ -48,7 +50,8 @@ class ExportedFunction:
         inputs: values of each input by name, ``(200, *shape)``, float64.
         outputs: names of the outputs.
         about: units and meaning, for the file.
-        model: the model of which the function calls a part several times, or None.
+        model: the model of which the function calls a part several times, or None. The function
+            takes a copy that calls this part as ``model=``.
     """
 
     def __init__(
@@ -80,8 +83,10 @@ class ExportedFunction:
             return {self.name: self.program}
         n, m = self._model.num_coordinates, self._model.num_inputs
         example = {name: values[0] for name, values in self.inputs.items()}
-        with calling_part(self._model, *torch.zeros(2 * n + m).double().split([2 * n, m])) as part:
-            return {"part": part, self.name: trace(self.function, example, self.outputs)}
+        state, u = torch.zeros(2 * n + m).double().split([2 * n, m])
+        calling, part = calling_part(self._model, state, u)
+        function = partial(self.function, model=calling)
+        return {"part": part, self.name: trace(function, example, self.outputs)}
 
     def compare(self, call: Call, tolerance: float) -> None:
         """Compare with a function of the file.
@@ -142,7 +147,7 @@ def write(
     module, writer = _WRITERS[path.suffix].split(":")
     path.parent.mkdir(parents=True, exist_ok=True)
     version = importlib.import_module("pinn_dyn").__version__
-    text = json.dumps({"pinn_dyn": version, "real": real, **info})
+    text = json.dumps({"pinn_dyn": version, "real": real, **info}, default=listed)
     # Written beside its place and then moved: a failure leaves the previous file, or none.
     with TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
         partial = Path(folder) / path.name

@@ -31,7 +31,7 @@ _KNOWN: dict[str, Callable[..., float]] = {
 """Operations that are evaluated here if all operands are known."""
 _LONGEST = 80  # characters of an expression that is written into the one that uses it
 _MOST_WEIGHTS = 64  # learned numbers of a matrix, beyond which a loop is faster
-_MOST_WORK = 100_000  # operations with zeros, beyond which compilers take long
+_MOST_WORK = 150_000  # operations with zeros, beyond which compilers take long
 
 Term = int
 """Number of an entry of the list of terms."""

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat
 
+from pinn_dyn import wording
 from pinn_dyn.data import logs
 from pinn_dyn.data.bandwidth import bandwidth
 from pinn_dyn.data.logs.check.holds import held_rows
@@ -240,18 +241,17 @@ def _lines(source: logs.LogSource, held: Sequence[int], rows: int, step: float) 
     longest = max(held, default=1)
     if max(longest, rows) == 1:
         return []
-    signals = "u"
+    signals = ["u"]
     if rows > 1:
         of_u = max((held_rows(x.raw.u) for x in source.cleaned), default=1)
-        signals = ", ".join(["q"] + ["v"] * (source.v is not None) + ["u"] * (of_u > 1))
+        signals = ["q"] + ["v"] * (source.v is not None) + ["u"] * (of_u > 1)
         longest = max(rows, of_u)
-    name = "_target_: pinn_dyn.data.logs"
-    key = _key(source, "interpolate")
-    lines = [f"{key}: {{{name}.InterpolateHeld, longest: {2 * longest}, signals: [{signals}]}}"]
+    step_text = wording.step("InterpolateHeld", longest=2 * longest, signals=signals)
+    lines = [wording.line(_key(source, "interpolate"), step_text)]
     if rows > 1:
-        rate, gap = round_rate(rows * step), 10 * rows * step
-        key = _key(source, "resample_held")
-        lines.append(f"{key}: {{{name}.Resample, rate: {rate:.6g}, max_gap: {gap:.3g}}}")
+        rate, gap = round_rate(rows * step), float(f"{10 * rows * step:.3g}")
+        resample = wording.step("Resample", rate=rate, max_gap=gap)
+        lines.append(wording.line(_key(source, "resample_held"), resample))
     return lines
 
 
@@ -423,10 +423,9 @@ def _filter(
     filtered = any(isinstance(x, filters) for x in source.steps.values())
     if filtered or share < _NOISE or not cutoff < 0.4 / step:
         return []
-    key = _key(source, "filter")
+    reason = f"noise is {100 * share:.2g} % of the steps of q, the motion ends at {highest:.2g} Hz"
     return [
-        f"{key}: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}} # noise is "
-        f"{100 * share:.2g} % of the steps of q, and the motion ends at {highest:.2g} Hz"
+        wording.line(_key(source, "filter"), wording.step("Butterworth", cutoff=cutoff), reason)
     ]
 
 

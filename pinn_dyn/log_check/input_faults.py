@@ -24,9 +24,10 @@ HELD = "rows between two values of the input"
 _ROWS = 2500  # of the regression
 _LARGEST_DRIFT = 0.05
 _SHIFT = 0.02  # distance of candidates at the end of a run, s
+_FINER = 21  # candidates around the best one
 _LONGEST = 60.0  # s of a run that are used
 _CONSTANT = np.arange(-0.1, 0.11, 0.02)  # s, constant shifts that are tried beside the best delay
-_QUANTILES = np.linspace(0.6, 0.97, 16)  # of |u|, for saturation
+_QUANTILES = np.linspace(0.3, 0.97, 24)  # of |u|, for saturation
 _LESS = 0.5  # residual over that of a constant delay, below which a fault is clear
 _SMALL, _CLEAR = 1e-3, 0.2  # residuals: too small to matter; small enough to trust
 
@@ -108,7 +109,12 @@ def _faults(
             of_drifts = trial.shares(drifting) if len(drifts) else np.ones(1)
             best = min(_LESS * constant, _CLEAR)
             if constant > _SMALL and of_drifts.min() < best:
-                drift, best = minimum(drifts, of_drifts), float(of_drifts.min())
+                coarse = drifts[of_drifts.argmin()]
+                near = coarse + np.linspace(-1, 1, _FINER) * (drifts[-1] - drifts[-2])
+                finer = trial.shares(
+                    trial.data.input_at(i, times + near * trial.data.passed[:, None])
+                )
+                drift, best = minimum(near, finer), float(of_drifts.min())
             if rows > 1 and _follows_lines(trial, i):
                 held[i], drift = rows, 0.0
             if constant > _SMALL and held[i] == 1:
@@ -192,9 +198,8 @@ def _saturation(trial: _Trial, i: int, best: float) -> tuple[float, float]:
         ratio = (left_limited[below, k] ** 2).mean() / (left[below, 0] ** 2).mean()
         beyond = trial.residual(logged, below)[~below, 0]
         excess = (logged[:, 0] - limited[:, k])[~below]
-        follows_limit = ((beyond - excess) ** 2).mean() < _LESS**2 * (beyond**2).mean()
-        if follows_limit:
-            ratios[k] = ratio
+        if ratio < _LESS:
+            ratios[k] = np.sqrt(((beyond - excess) ** 2).mean() / (beyond**2).mean())
     k = int(ratios.argmin())
     # The lowest level is the edge of the candidates.
     if k == 0 or not ratios[k] < _LESS or trial.shares(limited)[k] > _CLEAR:

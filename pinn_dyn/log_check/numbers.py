@@ -18,6 +18,7 @@ _STILL = 0.01  # variance of a coordinate at rest as a share of the largest
 _PERIODIC = 0.6  # of the acceleration: largest share that periodic terms leave
 _FREE = 0.03  # largest share of the acceleration of a free motor that its input leaves
 _BETTER = 0.5  # residual with one unit of an angle over that with the other
+_EXACT = 1e-6  # residual that is one of rounding
 _LONGEST, _LAGGED = 0.2, 0.5  # lag of v, s; share over that without a lag
 _CLEAR = 0.8  # correlation of v and dq/dt
 
@@ -99,7 +100,7 @@ def _turns(data: Averages, k: int) -> bool:
     if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
         return True
     a, inputs = data.a[:, [k]], data.u
-    plain = unexplained(data, a, data.v)
+    plain = min(unexplained(data, a, data.v), unexplained(data, a, data.v, data.q))
     periodic = unexplained(data, a, data.v, np.sin(data.q), np.cos(data.q))
     if (
         periodic < _PERIODIC * plain
@@ -111,7 +112,7 @@ def _turns(data: Averages, k: int) -> bool:
     y = data.u if inputs.shape[1] else a
     form = "inverse dynamics" if inputs.shape[1] else "acceleration"
     in_radians, in_degrees = (unexplained(data, y, terms(x, form)) for x in (data, converted))
-    return in_radians < _BETTER * in_degrees
+    return in_radians < _BETTER * in_degrees and in_degrees > _EXACT
 
 
 def check_velocity_lag(

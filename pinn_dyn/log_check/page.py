@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from pinn_dyn import wording
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.evaluation.log_figures import cleaning_figure
@@ -35,6 +36,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ROWS = 50  # of a table in the terminal
+_HEADS = {  # of options, in Python
+    "model/input=servo": "input=pinn_dyn.models.Servo",
+    "model/integrator=rosenbrock": "integrator=pinn_dyn.mechanics.Rosenbrock()",
+    "model/friction=coulomb": "friction=pinn_dyn.models.CoulombFriction",
+}
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
 _DRAWN = 1000  # rows of the equation of motion
 _FORCES = (
@@ -86,7 +92,7 @@ class LogCheck:
     @property
     def advice(self) -> list[str]:
         """Models of a training with their reasons and options, one in a line."""
-        return [f"A training, as {why}: {shlex.join(options)}" for why, options in self.candidates]
+        return [f"A training, as {why}: {_options(x)}" for why, x in self.candidates]
 
     @property
     def warnings(self) -> list[str]:
@@ -95,10 +101,11 @@ class LogCheck:
 
     @property
     def block(self) -> str:
-        """Entries to append to the YAML of the data set, "" if there are none."""
-        head = ["steps:"] if self.steps and not self.source.steps else []
-        lines = [*head, *(f"  {line}" for line in self.steps)]
-        lines += [] if self.delay is None else [f"delay: {self.delay} # s"]
+        """Entries to append to the data set, "" if there are none."""
+        lines = [f"  {line}" for line in self.steps]
+        if self.steps and not self.source.steps:
+            lines = [wording.steps(self.steps)]
+        lines += [] if self.delay is None else [wording.line("delay", self.delay, "s")]
         return "\n".join(lines)
 
     def table(self) -> pd.DataFrame:
@@ -159,6 +166,17 @@ class LogCheck:
         write_whole(folder / "measurements.csv", self.table().to_csv(index=False))
         write_whole(folder / "log_report.md", self.source.report)
         return folder / "check.html"
+
+
+def _options(options: Sequence[str]) -> str:
+    """Return the options of a training, on the command line or in Python."""
+    if wording.IN_YAML.get():
+        return shlex.join(options)
+    name = options[0].partition("=")[2]
+    if name != "lnn":
+        return wording.setting("model", name)
+    heads = "".join(f", {_HEADS[option]}" for option in options[1:])
+    return f"model=functools.partial(pinn_dyn.models.LagrangianNetwork{heads})"
 
 
 def _cause(text: str) -> str:

@@ -287,7 +287,7 @@ def check_runs(
             continue
         ratios = np.where(bad, residual / usual, 0)
         j = int(ratios.max(axis=0).argmax())
-        cause = _cause(narrow, bad[:, j][rows], j, labels, inverse)
+        cause = _cause(narrow, bad.any(axis=1)[rows], j, labels, inverse)
         times = narrow.data.t[bad.any(axis=1)[rows]]
         if not cause and (bad.any(axis=1).sum() < _UNKNOWN_WINDOWS or not exact):
             continue  # a generic equation is no exact one

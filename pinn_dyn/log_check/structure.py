@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs import Columns, Measurement
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import Averages
@@ -178,6 +179,8 @@ def _left(cause: _Cause, joints: Sequence[int]) -> float:
     shares = []
     for i in joints:
         rows = cause.data.moving[:, i]
+        if rows.sum() < _FEW // 4:  # exchanged with a joint that rests
+            return np.inf
         data = cause.data.rows(rows)
         columns = force_columns(data, i, cause.bodies[rows])
         if cause.extra is not None and cause.extra[0] == i:
@@ -201,9 +204,9 @@ def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -
     data = data.thinned(_FEW)
     plain = _Cause("", data, regressor(structure)(data.q, data.v, data.a))
     causes = sorted(_causes(structure, plain, joints), key=lambda cause: _left(cause, joints))
-    causes = causes[:_BEST]
+    causes = [cause for cause in causes[:_BEST] if np.isfinite(_left(cause, joints))]
     totals = np.array([_left_of_held_out(cause, joints) for cause in causes])
-    if not totals.min() < _EXPLAINS * _left_of_held_out(plain, joints):
+    if not totals.min(initial=np.inf) < _EXPLAINS * _left_of_held_out(plain, joints):
         return ""
     # In a plane, the mirror image of a reversed joint is the other joint reversed.
     ties = np.flatnonzero(totals < max(_TIE * totals.min(), 1e-6))
@@ -223,7 +226,8 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
         columns = "q, v and u" if power > 0 else "q and v"
         text = f"joint {name} turns the other way in the log: reverse its axis, or {columns} of it"
         yield changed(text, _scaled(data, reversed_k))
-        text = f"a spring at joint {name} explains it: fit it with model.springs=[{name}]"
+        springs = wording.setting("model.springs", [name])
+        text = f"a spring at joint {name} explains it: fit it with {springs}"
         yield replace(plain, text=text, extra=(k, data.q[:, k]))
         yield _affine(plain, rigid, k, name, joints)
     for i in range(size):
@@ -243,9 +247,10 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
             yield replace(plain, text=text, data=replace(data, u=data.u[:, order]))
             text = f"the columns of the joints {pair} are exchanged (q, v and u)"
             yield changed(text, _ordered(data, order))
+    setting = wording.setting("model.structure.gravity", [0.0, 0.0, 0.0])
     text = (
         "gravity is missing in the log, as in torques before its compensation is added: log the "
-        "torques that act, or set model.structure.gravity=[0,0,0]"
+        f"torques that act, or set {setting}"
     )
     weightless = changed(text, data, regressor(structure.with_gravity([0.0, 0.0, 0.0])))
     yield weightless
@@ -254,7 +259,8 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
     for axis in range(3):
         for sign in (1.0, -1.0):
             gravity = [sign * magnitude if x == axis else 0.0 for x in range(3)]
-            text = f"the base is mounted otherwise: set model.structure.gravity={gravity}"
+            setting = wording.setting("model.structure.gravity", gravity)
+            text = f"the base is mounted otherwise: set {setting}"
             cause = changed(text, data, regressor(structure.with_gravity(gravity)))
             if _left(cause, joints) < least / _TIE:  # gravity along an axis has no torque
                 yield cause

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+
+
+def listed(value: Any) -> Any:
+    """Return an array or a tensor as a list or a number, and other values unchanged."""
+    return value.tolist() if isinstance(value, Tensor | np.ndarray | np.generic) else value
 
 
 def require_last_dim(name: str, value: Tensor, size: int, symbol: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -84,59 +83,6 @@ class CompiledDynamics(Wrapped):
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         return self.inner.path(self._compiled, start, grid, signal)
-
-
-class RecordedSteps(Wrapped):
-    """Integrator that replays steps from a CUDA graph on a GPU, without gradients.
-
-    Dynamics that wait for the GPU cannot be recorded; they use the inner integrator.
-    """
-
-    def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        blocks = [torch.zeros_like(start)[None]]
-        step = None
-        for inputs, lengths in self.blocks(grid, signal):
-            if step is None:
-                try:
-                    step = _RecordedStep(dynamics, start, inputs[0], lengths[0].to(start))
-                except RuntimeError:
-                    return self.inner.path(dynamics, start, grid, signal)
-            pairs = zip(inputs, lengths.to(start), strict=True)
-            blocks.append(torch.stack([step(stages, h) for stages, h in pairs]))
-        return torch.cat(blocks)
-
-
-class _RecordedStep:
-    """A step as a CUDA graph, which continues from its last increment."""
-
-    def __init__(self, dynamics: Dynamics, start: Tensor, inputs: Tensor, h: Tensor):
-        self._increment = torch.zeros_like(start)
-        self._inputs, self._h = inputs.clone(), h.clone()
-        arguments = self._increment, start, self._inputs, self._h
-        with _refusing_to_wait():
-            dynamics.integration_step(*arguments)  # loads the kernels, as in _Recorded
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
-            self._increment.copy_(dynamics.integration_step(*arguments))
-
-    def __call__(self, inputs: Tensor, h: Tensor) -> Tensor:
-        self._inputs.copy_(inputs)
-        self._h.copy_(h)
-        self._graph.replay()
-        return self._increment.clone()
-
-
-@contextmanager
-def _refusing_to_wait() -> Iterator[None]:
-    """Raise RuntimeError for operations that wait for the GPU, within a context."""
-    before = torch.cuda.get_sync_debug_mode()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's, that this mode is a prototype
-        torch.cuda.set_sync_debug_mode("error")
-    try:
-        yield
-    finally:
-        torch.cuda.set_sync_debug_mode(before)
 
 
 def compile_graph(

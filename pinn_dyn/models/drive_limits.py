@@ -9,6 +9,7 @@ import torch
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor, nn
 
+from pinn_dyn.mechanics.arrays import listed
 from pinn_dyn.models.known_constants import Constants, Named
 from pinn_dyn.models.scales import Scales
 
@@ -54,6 +55,7 @@ class DriveLimits(nn.Module):
         spread: NonNegativeFloat = 1.0,
     ):
         super().__init__()
+        limit, stall, no_load_speed = map(listed, (limit, stall, no_load_speed))
         if (stall is None) != (no_load_speed is None) or (limit is None and stall is None):
             raise ValueError(
                 f"limits has limit {limit}, stall {stall} and no_load_speed {no_load_speed}, "

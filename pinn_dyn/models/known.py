@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -97,6 +98,7 @@ class KnownMechanics(LearnedConstants):
                 f"structure is a {type(structure).__name__}, expected rigid bodies such as a "
                 "RigidChain: use model=known_system for the constants of other systems"
             )
+        structure = copy.deepcopy(structure)  # its numbers become those of the model
         names = structure.joint_names
         driven = _driven_joints(statistics, structure, driven_joints, input is not None)
         if unknown := set(springs) - set(names):

@@ -4,16 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, Sum
+from pinn_dyn.models.cholesky import Positive
+from pinn_dyn.models.input_matrix import NoInput
 from pinn_dyn.models.known import KnownMechanics
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.models.structured import DAMPING, MASS, POTENTIAL
+
+_SMALL = Positive(floor=0.0, initial=0.1)
+SMALL_NETWORK = partial(
+    LagrangianNetwork,
+    mass=partial(MASS, positivity=_SMALL),
+    potential=partial(POTENTIAL, quadratic=False, initial=0.0),
+    damping=partial(DAMPING, positivity=_SMALL),
+    input=NoInput,
+)
+"""Network whose terms are small at the start."""
 
 
 class KnownAndNetwork(Sum):
@@ -29,7 +43,7 @@ class KnownAndNetwork(Sum):
 
     Args:
         statistics: scales of the data.
-        known, network: builders of the parts.
+        known, network: builders of the parts; by default, the terms of the network start small.
         residual: builder of the residual force.
         weight: w.
         integrator: the integration method.
@@ -42,7 +56,7 @@ class KnownAndNetwork(Sum):
         self,
         statistics: Statistics,
         known: Callable[..., KnownMechanics],
-        network: Callable[..., LagrangianNetwork],
+        network: Callable[..., LagrangianNetwork] = SMALL_NETWORK,
         residual: ResidualHead | None = None,
         weight: NonNegativeFloat = 0.01,
         integrator: Integrator | None = None,

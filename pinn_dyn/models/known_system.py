@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -73,7 +74,7 @@ class KnownSystem(LearnedConstants):
             names = [name] if len(units) == 1 else [f"{name} {k + 1}" for k in range(len(units))]
             self.learned[name] = PositiveConstants(start.flatten(), spread, names, units)
             self.shapes[name] = start.shape
-        self.structure = Called(structure, _term)
+        self.structure = Called(copy.deepcopy(structure), _term)
 
     def parts(self) -> list[tuple[str, PositiveConstants]]:
         """Return the constants by their names in the structure."""

@@ -11,6 +11,8 @@ import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor, nn
 
+from pinn_dyn import wording
+from pinn_dyn.mechanics.arrays import listed
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.known_constants import Constants, Named
 from pinn_dyn.models.scales import Scales
@@ -68,8 +70,9 @@ class Servo(InputMatrix):
         if inputs not in (len(index), 2 * len(index)):
             raise ValueError(
                 f"the data have {inputs} inputs, expected targets of {len(index)} joints, or "
-                "targets and then feed-forward forces: correct dataset.u.columns, or "
-                "model.input.joints"
+                "targets and then feed-forward forces: correct "
+                f"{wording.setting('dataset.u.columns')}, or "
+                f"{wording.setting('model.input.joints')}"
             )
         self.register_buffer("selection", torch.eye(size)[index], persistent=False)
         data = scales.statistics
@@ -77,6 +80,7 @@ class Servo(InputMatrix):
         if not scales.prior:
             force = super().typical_force(data.u_rms[-len(index) :]).double()
         spread_of_q = data.q_std[index].double()
+        stiffness, limit = listed(stiffness), listed(limit)
         if stiffness is None and limit not in (None, "learned"):
             stiffness = (torch.as_tensor(limit) / spread_of_q).tolist()  # saturates at that error
         if stiffness is None:

@@ -77,19 +77,20 @@ def build_part(
     """
     check_value(name, config)
     try:
-        maker = _built({**config, "_partial_": True})
+        maker = built({**config, "_partial_": True})
         return maker if partial_ else maker(*arguments, **extra)
     except Exception as error:  # constructors may raise anything
         reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         raise ConfigError(f"{name}: {reason}") from error
 
 
-def _built(part: Any) -> Any:
+def built(part: Any) -> Any:
+    """Build the objects that a part of a configuration describes, without checks."""
     if isinstance(part, list):
-        return [_built(item) for item in part]
+        return [built(item) for item in part]
     if not isinstance(part, dict):
         return part
-    values = {k: _built(x) for k, x in part.items() if k not in ("_target_", "_partial_")}
+    values = {k: built(x) for k, x in part.items() if k not in ("_target_", "_partial_")}
     if "_target_" not in part:
         return values
     maker = partial(pkgutil.resolve_name(part["_target_"]), **values)

@@ -31,6 +31,7 @@ def fit(
     run: str | None = None,
     model: str | ModelBuilder | Predictor = "lnn",
     cleaning: Mapping[str, Step] | None = None,
+    delay: float | Sequence[float] = 0.0,
     steps: PositiveInt | None = None,
     seed: int = 0,
     **options: Any,
@@ -52,7 +53,8 @@ def fit(
         run: column that tells runs apart; None if all rows are one run.
         model: as in :func:`~pinn_dyn.train`.
         cleaning: names and steps of the cleaning, in order.
-        steps: steps of the optimizer, 1,000 by default.
+        delay: time between an input and its action, one number or M, s.
+        steps: steps of the optimizer; None for the default, see :func:`~pinn_dyn.train`.
         seed: seed of the weights, the batches and the choice of runs.
         options: other arguments of :func:`~pinn_dyn.train`, such as ``folder="runs/arm"``.
 
@@ -61,13 +63,16 @@ def fit(
         ValueError: if columns, units, clocks or settings cannot be used; names them.
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
+    if isinstance(steps, Mapping):
+        raise TypeError("steps are those of the optimizer: cleaning={...} has the steps of the log")
     signals = {"time": time, "q": q, "u": u, "v": v}
     columns: dict[str, Any] = {
         name: {"columns": value, "unit": _SI[name]} if isinstance(value, (str, Sequence)) else value
         for name, value in signals.items()
     }
     files = _files(frame)
-    source = LogSource(files=files, trajectory=run, steps=cleaning, seed=seed, **columns)
+    settings: dict[str, Any] = {"trajectory": run, "steps": cleaning, "delay": delay}
+    source = LogSource(files=files, seed=seed, **settings, **columns)
     return train(source, model, steps=steps, seed=seed, **options)
 
 

@@ -17,7 +17,7 @@ import torch
 
 from pinn_dyn import evaluation
 from pinn_dyn.data import DataSource
-from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.evaluation.metrics import validation_error
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.identification.constants import (
     CONSTANTS,
@@ -30,6 +30,7 @@ from pinn_dyn.identification.rigid_excitation import rigid_excitation
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.run.build import ConfigError, naming
+from pinn_dyn.run.defaults import defaults, section
 from pinn_dyn.run.prepared import PreparedTraining
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
@@ -39,8 +40,6 @@ from pinn_dyn.whole import save_whole, write_whole
 
 log = logging.getLogger(__name__)
 
-_DEFAULTS: list[Any] = [("accelerator", "cpu"), ("devices", 1)]  # in conf
-_DEFAULTS += [("gradient_clip_val", 1.0), ("gradient_clip_val", None)]
 _SHOWN = 2  # directions in the log
 _MOVE = "Move {} at more frequencies, poses and speeds. excite.py designs such a motion."
 _NO_MOTION = (
@@ -61,7 +60,8 @@ def check_trainer(settings: Mapping[str, Any]) -> None:
 
     A fit of constants has no trainer.
     """
-    changed = [key for key, value in settings.items() if (key, value) not in _DEFAULTS]
+    usual = section(defaults("", on_log=False), "trainer")
+    changed = [key for key, x in settings.items() if x is not None and x != usual.get(key)]
     if not changed:  # without the import of Lightning
         return
     from lightning import Trainer
@@ -208,7 +208,7 @@ def _write_log(
         for name, value in metrics.items():
             boards[0].add_scalar(name, value, 0)
     for board in boards:
-        error = {"hp/validation_error": metrics[VALIDATION_ERROR]}
+        error = {"hp/validation_error": validation_error(metrics)}
         board.add_hparams(training.compared_settings(), error, run_name=".", global_step=0)
         for name, figure in figures.items():
             board.add_figure(name, figure, 0)

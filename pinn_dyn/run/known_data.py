@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from pinn_dyn import wording
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.log_check.check import verdict
 from pinn_dyn.mechanics import double_copy
@@ -17,8 +18,6 @@ from pinn_dyn.run.build import ConfigError, ModelBuilder
 from pinn_dyn.systems import RigidChain
 
 log = logging.getLogger(__name__)
-
-_PATH = "model.structure"
 
 
 def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str, Any]]:
@@ -95,9 +94,8 @@ def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
         expected = "rad" if turns else "m"
         if unit not in ("", expected):
             raise ConfigError(
-                f"{column} is in {unit}, expected {expected} for the joint {joint} of {_PATH}, "
-                f"which {'turns' if turns else 'slides'}: check the order of the columns, and the "
-                "unit"
+                f"{column} is in {unit}, expected {expected} for the joint {joint}, which "
+                f"{'turns' if turns else 'slides'}: check the order of the columns, and the unit"
             )
     return structure
 
@@ -111,10 +109,11 @@ def _check_order(key: str, columns: Sequence[str], structure: RigidChain) -> Non
     crossed = any(x not in (None, k) for k, x in enumerate(matches)) and len(steps) > 1
     if len(columns) != len(names) or (crossed and structure.joints is None):
         free = iter([name for k, name in enumerate(names) if k not in matches])
-        guess = ",".join(next(free, "?") if k is None else names[k] for k in matches)
-        way = f"name the joints of the columns in their order, as {_PATH}.joints=[{guess}]"
+        guess = [next(free, "?") if k is None else names[k] for k in matches]
+        joints = wording.setting("model.structure.joints", guess)
+        way = f"name the joints of the columns in their order, as {joints}"
         raise ConfigError(
-            f"{key} has the columns {', '.join(columns)}, and {_PATH} the joints "
+            f"{key} has the columns {', '.join(columns)}, and the structure the joints "
             f"{', '.join(names)}: {'leave out columns' if '?' in guess else way}"
         )
     _log_order(key, columns, names)
@@ -155,7 +154,9 @@ def check_known(model: KnownMechanics, source: DataSource) -> None:
         if inputs:
             raise ConfigError(
                 f"the inputs are {', '.join(inputs)}, no forces: set drive gains, as "
-                "model.drive_gain=10 model.gain_spread=0.5, or correct dataset.u.unit"
+                f"{wording.setting('model.drive_gain', 10)} and "
+                f"{wording.setting('model.gain_spread', 0.5)}, or correct "
+                f"{wording.setting('dataset.u.unit')}"
             )
 
 
@@ -172,7 +173,10 @@ def warn_of_log(model: Any, source: DataSource) -> None:
 def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
     """Return the keys of q, v and u, each with names and units of its columns; "" if unknown."""
     if not isinstance(source, LogSource):
-        labels = {"dataset.labels": source.labels, "dataset.input_labels": source.input_labels}
+        labels = {
+            wording.setting("dataset.labels"): source.labels,
+            wording.setting("dataset.input_labels"): source.input_labels,
+        }
         pairs = {
             k: [x.rstrip("]").partition(" [")[::2] for x in texts] for k, texts in labels.items()
         }
@@ -184,7 +188,8 @@ def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
                 "" if f == "1" else f if u == "1" else u
                 for u, f in zip(x.units, x.unit, strict=True)
             ]
-            signals.append((f"dataset.{key}.columns", dict(zip(x.columns, units, strict=True))))
+            path = wording.setting(f"dataset.{key}.columns")
+            signals.append((path, dict(zip(x.columns, units, strict=True))))
     return signals
 
 

@@ -15,7 +15,7 @@ import torch
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
+from pinn_dyn.evaluation.metrics import score
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
@@ -65,7 +65,7 @@ class PreparedTraining:
     start: float
 
     def record(self, steps: int, validation: Mapping[str, Any], **facts: Any) -> dict[str, Any]:
-        """Return the record of a training of some steps, with its last metrics."""
+        """Return the record of a training of some steps, with the metrics of its model."""
         return {
             **self.facts,
             **facts,
@@ -82,15 +82,12 @@ class PreparedTraining:
         return {key: x if isinstance(x, (int, float)) else str(x) for key, x in settings.items()}
 
     def finish(self, record: dict[str, Any]) -> None:
-        """Write the record of the finished training, and log the validation error."""
-        finish(self.folder, record)
-        error = record["validation"].get(VALIDATION_ERROR, float("nan"))
-        diverged = record["validation"].get("val/diverged", 0)
+        """Write the record of the last step, completed by the score of the model that is kept."""
+        record = finish(self.folder, record)
         log.info(
-            "%s seed %d: validation error %s over %s after %.0f s of training, in %s",
-            *(record["name"], record["seed"]),
-            f"{diverged:g} diverged" if diverged else f"{error:.5f}",
-            *(self.validator, record["training_seconds"], self.folder),
+            "%s seed %d: validation error over %s %s, after %.0f s of training, in %s",
+            *(record["name"], record["seed"], self.validator, score(record)),
+            *(record["training_seconds"], self.folder),
         )
 
 
@@ -188,10 +185,11 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
             f"the model uses {model.input_history} s before its start, but data.history is "
             f"{windows.history} s: set data.history={model.input_history}"
         )
-    if model.past_steps > 20 * windows.steps:
+    steps = len(windows.windows.t) - 1
+    if model.past_steps > 20 * steps:
         log.warning(
             f"the model sees {model.past_steps} steps of {windows.step:g} s before windows of "
-            f"{windows.steps} steps: increase data.stride or data.steps, or reduce model.history"
+            f"{steps} steps: increase data.stride or data.steps, or reduce model.history"
         )
 
 

@@ -78,6 +78,9 @@ def load_run(
         named = config if model is None else {k: x for k, x in config.items() if k != "model"}
         require_trusted(named, str(path), trust)
     record = saved.get(RECORD, {})
+    if checkpoint == "last" and "last_validation" in record:
+        record = {k: x for k, x in record.items() if k != "kept_step"}
+        record["validation"] = record["last_validation"]
     if record and not saved.get(FINISHED):
         log.warning("%s: the training has not ended", path)
     try:
@@ -177,13 +180,20 @@ def newest_checkpoint(folder: Path) -> tuple[Path | None, dict[str, Any]]:
     return None, {}
 
 
-def finish(folder: Path, record: dict[str, Any]) -> None:
-    """Write the record of a training that has ended into its checkpoints, and a copy beside."""
-    for name in ("best", "last"):
-        path = folder / CHECKPOINTS / f"{name}.ckpt"
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-        save_whole(path, {**saved, RECORD: record, FINISHED: True})
+def finish(folder: Path, record: dict[str, Any]) -> dict[str, Any]:
+    """Write the record of a training that has ended into its checkpoints, and a copy beside.
+
+    ``record`` is that of the last step. The result has the step and the metrics of the best
+    checkpoint, ``kept_step`` and ``validation``, beside ``last_validation``.
+    """
+    paths = [folder / CHECKPOINTS / f"{name}.ckpt" for name in ("best", "last")]
+    saved = [torch.load(path, map_location="cpu", weights_only=True) for path in paths]
+    kept = {"kept_step": saved[0]["global_step"], "validation": saved[0][RECORD]["validation"]}
+    record = {**record, "last_validation": record["validation"], **kept}
+    for path, content in zip(paths, saved, strict=True):
+        save_whole(path, {**content, RECORD: record, FINISHED: True})
     write_whole(folder / METRICS, json.dumps(record, indent=2))
+    return record
 
 
 def require_same_data(

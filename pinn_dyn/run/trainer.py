@@ -23,7 +23,7 @@ from pinn_dyn.data import LightningData
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
-from pinn_dyn.evaluation.metrics import BEST_BY, VALIDATION_ERROR
+from pinn_dyn.evaluation.metrics import BEST_BY, error_text, validation_error
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
@@ -145,8 +145,8 @@ class _ProgressLines(L.Callback):
         """Update the steps, the loss and the validation error."""
         assert isinstance(pl_module, DynamicsLearner)
         text = f", loss {pl_module.latest_loss:.4g}"
-        if (error := trainer.callback_metrics.get(VALIDATION_ERROR)) is not None:
-            text += f", validation error {error:.4g}"
+        if metrics := validation_metrics(trainer):
+            text += f", validation error {error_text(metrics)}"
         self.progress.update(trainer.global_step, text)
 
     def teardown(self, *_: Any, **__: Any) -> None:
@@ -209,6 +209,12 @@ def tensorboard(folder: Path) -> TensorBoardLogger:
     return TensorBoardLogger(str(folder), name="tensorboard", version="", default_hp_metric=False)
 
 
+def validation_metrics(trainer: L.Trainer) -> dict[str, float]:
+    """Return the metrics of the latest validation, empty before the first."""
+    metrics = trainer.callback_metrics.items()
+    return {name: float(value) for name, value in metrics if name.startswith("val/")}
+
+
 class Recorder(L.Callback):
     """Record of a training and the identity of its data, for its checkpoints and TensorBoard."""
 
@@ -219,16 +225,20 @@ class Recorder(L.Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Add the record and the identity."""
-        checkpoint[RECORD] = self.training.record(trainer.global_step, trainer.callback_metrics)
+        metrics = validation_metrics(trainer)  # the loss is that of an earlier epoch
+        checkpoint[RECORD] = self.training.record(trainer.global_step, metrics)
         checkpoint[DATA] = self.training.identity
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log settings and the validation error for the tab HPARAMS of TensorBoard."""
-        error = trainer.callback_metrics.get(VALIDATION_ERROR)
+        """Log settings and the error of the kept model for the tab HPARAMS of TensorBoard."""
+        if not trainer.is_global_zero:
+            return
+        kept = read_checkpoint(self.training.folder / CHECKPOINTS / "best.ckpt")[RECORD]
+        error = validation_error(kept["validation"])
         for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger) and error is not None:
+            if isinstance(logger, TensorBoardLogger):
                 settings = self.training.compared_settings()
-                logger.log_hyperparams(settings, {"hp/validation_error": float(error)})
+                logger.log_hyperparams(settings, {"hp/validation_error": error})
 
 
 @isolate_rng()
@@ -261,7 +271,7 @@ def train_network(
     # A missing compiler or device is refused before data are simulated.
     compiled = compiles(compile, length[0], settings)
     if callbacks is None:
-        callbacks = [RolloutFigures(every_n_validations=4)]
+        callbacks = [RolloutFigures()]
     if loggers is None:
         loggers = [tensorboard(folder)]
     count = epochs(*length)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import inspect
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -29,7 +31,8 @@ from pinn_dyn.models import (
     NextStateMLP,
     SubspaceEncoder,
 )
-from pinn_dyn.run.build import ModelBuilder
+from pinn_dyn.run.build import ModelBuilder, built
+from pinn_dyn.run.defaults import defaults, even_validations, section
 from pinn_dyn.run.described import described
 from pinn_dyn.run.fit_constants import check_trainer, fit_constants
 from pinn_dyn.run.known_data import match_model
@@ -55,27 +58,11 @@ MODELS: dict[str, ModelBuilder] = {
     "lnn": LagrangianNetwork,
     "hnn": HamiltonianNetwork,
     "acceleration": AccelerationMLP,
-    "mlp": partial(NextStateMLP, activation="silu"),
+    "mlp": NextStateMLP,
     "subnet": SubspaceEncoder,
     "oscillators": CoupledOscillators,
 }
 """Models by their names in conf/model."""
-LOSSES: dict[str, Callable[..., WindowLoss]] = {
-    "increment": IncrementLoss,
-    "midpoint": MidpointLoss,
-}
-"""Losses by their names in conf/loss."""
-ADAMW = partial(AdamW, lr=0.005, weight_decay=1e-5, fused=True)
-TRAINER = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
-STEPS, LOG_STEPS = 20_000, 1000
-"""Default steps of the optimizer on simulated data and on a log."""
-_PAIRS, _BATCH = 10_000, 128  # at most, of a log
-_WINDOW, _STEP = 2, 0.02  # steps of a training window of a log, and their length in s
-_FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs for least squares, and steps for it and subnet
-_LATENT_WINDOW = 40  # steps, for oscillators
-_LATENT_LOSS = partial(IncrementLoss, velocity_weight=0.1)  # v is derived from q
-_LATENT_OPTIMIZER = partial(AdamW, lr=0.012, weight_decay=0.05, fused=True)
-_HISTORY = 0.5  # s of the past, for subnet
 _COLUMNS = [
     "name",
     "time",
@@ -107,7 +94,7 @@ def train(
     ensemble: PositiveInt = 1,
     compile: bool | Literal["auto"] = "auto",
     threads: PositiveInt = 1,
-    trainer: Mapping[str, Any] = TRAINER,
+    trainer: Mapping[str, Any] = MappingProxyType({}),
     callbacks: Sequence[Callback] | None = None,
     loggers: Sequence[Logger] | None = None,
     start_from: Run | None = None,
@@ -124,6 +111,10 @@ def train(
         data=partial(DynamicsData, steps=10, stride="20 ms", pairs=4000)
         optimizer=partial(torch.optim.AdamW, lr=0.002)
 
+    Arguments that are None depend on the model and on the kind of data. They are those of train.py,
+    see :func:`~.run.defaults.defaults`, also for ``activation`` of a ``NextStateMLP``, ``state`` of
+    a ``HamiltonianNetwork`` and ``friction`` of ``KnownMechanics``.
+
     A folder with an interrupted training of the same data and arguments is resumed, and a finished
     one is loaded. A folder with another training is refused.
 
@@ -134,22 +125,18 @@ def train(
             place.
         loss: builder, called with ``statistics=`` and ``model=``; or ``"increment"`` or
             ``"midpoint"``; None takes the increment loss.
-        optimizer: builder, called with the parameters; or a least-squares fit; None takes AdamW,
-            for oscillators with a higher learning rate and weight decay.
+        optimizer: builder, called with the parameters; or a least-squares fit; None takes AdamW.
         scheduler: builder, called with the optimizer and ``total_steps=``.
-        data: builder of the training windows, called with ``source=``; None takes windows of two
-            steps of about 20 ms from a log (ten for least squares and subnet), and the defaults of
-            :class:`~pinn_dyn.data.DynamicsData` from other sources. Oscillators have 40 steps of
-            about a tenth of a period of the fastest input or motion, fewer on short runs.
+        data: builder of the training windows, called with ``source=``.
         validator: builder of the validation, called with ``training_step=``.
-        steps: steps of the optimizer; None takes 1,000 on a log and 20,000 on other sources.
-        validations: number of validations, a divisor of ``steps``; None takes up to 10 on a log
-            and up to 4 on other sources.
+        steps: steps of the optimizer.
+        validations: number of validations, a divisor of ``steps``.
         seed: seed of the weights and of the order of the windows.
         ensemble: number of models trained at once, with the seeds seed, seed + 1, ...
         compile: compile the dynamics; ``"auto"`` does in long trainings if there is a compiler.
         threads: CPU threads; small networks are fastest with one.
-        trainer: arguments of :class:`lightning.Trainer`, which least squares does not use.
+        trainer: arguments of :class:`lightning.Trainer` beside the defaults; least squares uses
+            none.
         callbacks: callbacks; None draws figures of rollouts if there is a folder.
         loggers: loggers; None writes a TensorBoard log to the folder.
         start_from: a run whose weights the training starts from.
@@ -169,14 +156,23 @@ def train(
         temporary = TemporaryDirectory(prefix="pinn_dyn-")
         folder, callbacks = temporary.name, callbacks or ()
     run_folder = Path(folder).expanduser()
-    latent = model == "oscillators"
-    loss = loss or (_LATENT_LOSS if latent else IncrementLoss)
-    optimizer = optimizer or (_LATENT_OPTIMIZER if latent else ADAMW)
-    steps, validations, trainer = _length(source, optimizer, steps, validations, trainer)
-    data = data or _windows(source, model, optimizer)
-    model, model_name = _builder(source, model, model_name)
+    on_log, least_squares = isinstance(source, LogSource), isinstance(optimizer, LeastSquares)
+    model, model_name = _builder(model, model_name)
+    values = defaults(_factory(model).__name__, on_log=on_log, least_squares=least_squares)
+    usual = section(values, "trainer")
+    usual_steps, most_validations = usual.pop("steps"), usual.pop("validations")
+    steps = steps or usual_steps
+    validations = validations or even_validations(steps, most_validations)
+    if config is None:
+        model, trainer = _with_defaults(model, on_log), {**usual, **trainer}
+    if least_squares:
+        check_trainer(trainer)
+    data = data or partial(DynamicsData, **section(values, "data"), history=_history(model))
+    optimizer = optimizer or partial(AdamW, **section(values, "optimizer"))
+    losses = {"increment": partial(IncrementLoss, **section(values, "loss"))}
+    if loss is None or isinstance(loss, str):
+        loss = _by_name("loss", loss or "increment", {**losses, "midpoint": MidpointLoss})
     model, changes = match_model(model, source)
-    loss = _by_name("loss", loss, LOSSES)
     made_in_python = config is None
     if config is None:
         parts = dict(data=data, loss=loss, optimizer=optimizer, scheduler=scheduler)
@@ -250,60 +246,44 @@ def _way_on(folder: Path, is_temporary: bool, overwrite: bool) -> str:
     return f"the same call resumes it from {folder}" + " without overwrite" * overwrite
 
 
-def _length(
-    source: DataSource,
-    optimizer: Any,
-    steps: int | None,
-    validations: int | None,
-    trainer: Mapping[str, Any],
-) -> tuple[int, int, dict[str, Any]]:
-    """Return steps, validations and further settings of the trainer; a fit is a single step."""
-    if isinstance(optimizer, LeastSquares):
-        check_trainer(trainer)
-        return 1, 1, {key: x for key, x in trainer.items() if not key.startswith("gradient_clip")}
-    is_log = isinstance(source, LogSource)
-    steps = steps or (LOG_STEPS if is_log else STEPS)
-    return steps, validations or even_validations(steps, 10 if is_log else 4), dict(trainer)
-
-
-def _builder(source: DataSource, model: Any, name: str | None) -> tuple[Any, str | None]:
+def _builder(model: Any, name: str | None) -> tuple[Any, str]:
     """Return the builder of a model that may be a name, and its short name."""
-    if not isinstance(model, str):
-        return model, name
-    builder = _by_name("model", model, MODELS)
-    if model == "hnn" and isinstance(source, LogSource):  # a log has no momenta
-        builder = partial(builder, state="qv")
-    return builder, name or model
+    if isinstance(model, str):
+        return _by_name("model", model, MODELS), name or model
+    return model, name or _factory(model).__name__
 
 
-def _by_name(kind: str, value: Any, names: Mapping[str, Any]) -> Any:
-    """Return the builder of a name, or the value if it is no name."""
-    if not isinstance(value, str):
-        return value
+def _factory(model: Any) -> Any:
+    """Return the class or function of a builder, or the class of a built model."""
+    factory = model.func if isinstance(model, partial) else model
+    return factory if hasattr(factory, "__name__") else type(factory)
+
+
+def _by_name(kind: str, value: str, names: Mapping[str, Any]) -> Any:
     if value not in names:
         expected = f", expected {', '.join(names)} or a builder like partial(KnownMechanics, ...)"
         raise ValueError(f"{kind} is {value!r}{did_you_mean(value, names) or expected}")
     return names[value]
 
 
-def _windows(source: DataSource, model: Any, optimizer: Any) -> Callable[..., DynamicsData]:
-    """Return the builder of the default windows."""
-    if model == "oscillators":
-        windows = partial(DynamicsData, pairs=_PAIRS, batch_size=_BATCH, stride="auto")
-        step = windows(source=source, batches_per_epoch=1, seed=0).step
-        longest = max(item.duration for item in source.load().train)
-        return partial(windows, steps=max(1, min(_LATENT_WINDOW, int(longest / 2 / step))))
-    if not isinstance(source, LogSource):
-        return DynamicsData
-    t = source.load().train[0].t
-    stride = max(round(_STEP / float(t[1] - t[0])), 1)
-    few = isinstance(optimizer, LeastSquares)
-    pairs, steps = (_FEW_PAIRS, _LONG_WINDOW) if few else (_PAIRS, _WINDOW)
-    batch = min(_BATCH, pairs)
-    windows = partial(DynamicsData, pairs=pairs, steps=steps, stride=stride, batch_size=batch)
-    if model == "subnet":
-        return partial(windows, history=_HISTORY, steps=_LONG_WINDOW)
-    return windows
+def _with_defaults(model: Any, on_log: bool) -> Any:
+    """Return the builder of a model with the settings that the command line has by default."""
+    if isinstance(model, Predictor):
+        return model
+    settings = getattr(model, "keywords", {})
+    values = section(defaults(_factory(model).__name__, on_log=on_log), "model")
+    changes = built({k: x for k, x in values.items() if k not in settings})
+    if "known" in settings:
+        changes["known"] = _with_defaults(settings["known"], on_log)
+    return partial(model, **changes) if changes else model
+
+
+def _history(model: Any) -> float:
+    """Return the time before its start that a model sees, s."""
+    if isinstance(model, Predictor):
+        return model.input_history
+    arguments = inspect.signature(model).parameters
+    return arguments["history"].default if "history" in arguments else 0.0
 
 
 def _model_description(model: Any) -> dict[str, Any]:
@@ -319,11 +299,9 @@ def _model_description(model: Any) -> dict[str, Any]:
 
 
 def _description(
-    source: DataSource, model: Any, name: str | None, parts: Mapping[str, Any]
+    source: DataSource, model: Any, name: str, parts: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Describe a training in Python; its trajectories are stored in the run folder."""
-    factory = model.func if isinstance(model, partial) else model
-    name = name or getattr(factory, "__name__", type(factory).__name__)
     stored = {
         "_target_": "pinn_dyn.data.StoredSource",
         "path": TRAJECTORIES,
@@ -339,8 +317,3 @@ def _description(
         columns = {key: described(getattr(source, key)) for key in _COLUMNS}
         config["log"] = {"_target_": "pinn_dyn.data.LogSource", "files": "*", **columns}
     return config | _model_description(model) | {key: described(x) for key, x in parts.items()}
-
-
-def even_validations(steps: int, limit: int) -> int:
-    """Return the largest number of validations, up to ``limit``, that divides the steps."""
-    return max(count for count in range(1, limit + 1) if steps % count == 0)

@@ -93,6 +93,11 @@ class SoftArm(MechanicalSystem):
         for name, value in (("_s", (points + 1) / 2), ("_weights", weights / 2)):
             self.register_buffer(name, torch.from_numpy(value), persistent=False)
 
+    @property
+    def nodes(self) -> int:
+        """Number of Gauss-Legendre nodes per segment."""
+        return len(self._s)
+
     def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
         """Check that the equation of motion holds for all q from ``q_low`` to ``q_high``, ``(N,)``.
 

@@ -110,7 +110,7 @@ class LeastSquares:
     def __init__(
         self,
         *,
-        cutoff: PositiveFloat,
+        cutoff: PositiveFloat = 6.0,
         rollouts: bool = True,
         samples: AtLeastTwo = 2000,
         evaluations: AtLeastTwo = 25,

@@ -47,7 +47,7 @@ class SOAP(Optimizer):
         params: Iterable[nn.Parameter] | Iterable[dict[str, Any]],
         lr: PositiveFloat = 3e-3,
         betas: tuple[Beta, Beta] = (0.95, 0.95),
-        weight_decay: NonNegativeFloat = 1e-2,
+        weight_decay: NonNegativeFloat = 1e-5,
         precondition_frequency: PositiveInt = 10,
         eps: PositiveFloat = 1e-8,
     ):

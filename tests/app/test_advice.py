@@ -21,7 +21,7 @@ KNOWN = ["dataset=csv_log", "dataset.root={folder}", "dataset.files=arm.csv", *L
 KNOWN += ["dataset.q.columns=[q1,q2]", "dataset.q.unit=rad", "dataset.u.columns=[u1,u2]"]
 for part in ("validation", "test"):
     KNOWN += [f"+dataset.{part}.seconds=2.0", f"dataset.{part}.piece=1.0"]
-KNOWN += ["model=known", "model/structure=urdf", f"model.structure.urdf={PENDULUM}"]
+KNOWN += ["model=known", "data.steps=1", "model/structure=urdf", f"model.structure.urdf={PENDULUM}"]
 FIT = ["train.py", *KNOWN, "dataset.u.unit=Nm", "optimizer=least_squares"]
 SHORT = ["steps=2", "duration=3"]
 ROBOT = f"model.structure.urdf={PENDULUM}"
@@ -29,7 +29,7 @@ STEP = ["duration=0.05", "settled_after=0.03", "animate=false", "rate=200"]
 LOOP = ["run={lnn}", *SET_POINTS, "~controllers.truth", "~controllers.pd", "runs=1"]
 CONTINUOUS = [*LOOP, "rate=null", "controllers.learned.terms=truth"]
 COMMANDS = {
-    "no momenta": ["train.py", *LOG, "model=hnn"],
+    "no momenta": ["train.py", *LOG, "model=hnn", "model.state=qp"],
     "midpoint, no derivative": ["train.py", *TINY, "model=mlp", "loss=midpoint"],
     "midpoint, several steps": ["train.py", *TINY, "model=lnn", "loss=midpoint", "data.steps=2"],
     "midpoint, learned velocity": [

@@ -1,6 +1,5 @@
 """Python API: train, fit, load, predictions and terms."""
 
-import inspect
 import itertools
 import re
 import shutil
@@ -17,13 +16,10 @@ import torch
 from scipy.signal import savgol_filter
 
 import pinn_dyn
-from pinn_dyn.app.config import composed
-from pinn_dyn.app.train import training_arguments
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.data.logs import InputDelay, MovingAverage
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import AccelerationMLP, LagrangianNetwork
-from pinn_dyn.run.training import STEPS
 from tests.app.entry import ROOT, TINY_DATA, run_script
 
 Q = {"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]}
@@ -233,53 +229,6 @@ def test_a_black_box_has_no_terms(black_box):
 # Training.
 
 
-def test_train_has_the_defaults_of_the_command_line(monkeypatch):
-    built = training_arguments(composed("train", ["model_name=hnn"]), ROOT)
-    defaults = {
-        name: parameter.default
-        for name, parameter in inspect.signature(pinn_dyn.train).parameters.items()
-    }
-    for name in ("seed", "ensemble", "compile", "threads"):
-        assert built[name] == defaults[name]
-    assert built["steps"] == STEPS
-    assert built["validations"] == 4
-    assert built["trainer"] == defaults["trainer"]
-    used = {}
-
-    def stop(source, model, name, parts):
-        used.update(parts)
-        raise InterruptedError
-
-    monkeypatch.setattr("pinn_dyn.run.training._description", stop)
-    with pytest.raises(InterruptedError):
-        pinn_dyn.train(Still(), "hnn")
-
-    def arguments(builder):
-        function = getattr(builder, "func", builder)
-        signature = inspect.signature(function).parameters
-        given = {k: p.default for k, p in signature.items() if p.default is not p.empty}
-        return function, given | getattr(builder, "keywords", {})
-
-    for name in ("loss", "optimizer", "scheduler", "data", "validator"):
-        assert arguments(built[name]) == arguments(used[name]), name
-
-
-@pytest.mark.parametrize("name", ["lnn", "hnn", "acceleration", "mlp"])
-def test_a_named_model_is_that_of_the_command_line(name):
-    """Equal weights of equal seeds, from the same statistics."""
-    source = pinn_dyn.dataset("soft_arm_1", **dict(word[8:].split("=") for word in TINY_DATA))
-    statistics = DynamicsData(source, stride=1, pairs=8, batch_size=8, batches_per_epoch=1, seed=0)
-    from pinn_dyn.run.training import MODELS
-
-    configured = training_arguments(composed("train", [f"model={name}", "model_name=x"]), ROOT)
-    weights = []
-    for builder in (MODELS[name], configured["model"]):
-        torch.manual_seed(0)
-        weights.append(builder(statistics=statistics.statistics).state_dict())
-    assert weights[0].keys() == weights[1].keys()
-    assert all(torch.equal(value, weights[1][key]) for key, value in weights[0].items())
-
-
 def test_train_gives_the_weights_of_the_command_line(tmp_path, lnn_run):
     source = pinn_dyn.dataset("soft_arm_1", **dict(word[8:].split("=") for word in TINY_DATA))
     run = pinn_dyn.train(
@@ -465,13 +414,19 @@ def test_train_and_fit_have_one_set_of_defaults():
     frame = log()
     fitted = pinn_dyn.fit(frame, q=Q, u=U, run="run", steps=1)
     source = pinn_dyn.LogSource(files=frame, time="t", q=Q, u=U, trajectory="run")
-    for model in ("lnn", "hnn", "subnet"):
-        trained = pinn_dyn.train(source, model, steps=1)
-        assert trained.config["data"]["steps"] == (10 if model == "subnet" else 2)
-        if model == "lnn":
-            assert trained.metrics["validation"] == fitted.metrics["validation"]
-            for key in ("data", "validator", "optimizer", "loss", "trainer", "log"):
-                assert trained.config[key] == fitted.config[key]
+    trained = pinn_dyn.train(source, "lnn", steps=1)
+    assert trained.metrics["validation"] == fitted.metrics["validation"]
+    for key in ("data", "validator", "optimizer", "loss", "trainer", "log"):
+        assert trained.config[key] == fitted.config[key]
+
+
+def test_a_delay_of_the_inputs_is_that_of_the_source():
+    assert fit(delay=0.04).input_delay == pytest.approx([0.04] * 3)
+
+
+def test_steps_of_a_log_are_called_cleaning():
+    with pytest.raises(TypeError, match=r"cleaning=\{...\} has the steps of the log"):
+        fit(steps={"smooth": MovingAverage(3)})
 
 
 @pytest.mark.parametrize("kind", ["dict", "list", "columns", "path"])

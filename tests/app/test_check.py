@@ -115,9 +115,7 @@ def test_no_training_is_printed_where_an_angle_turns_too_far_in_a_sample(tmp_pat
 
 def test_only_the_program_changes_in_the_printed_training(monkeypatch):
     monkeypatch.setattr("sys.argv", ["checks/check.py", "dataset=check_1"])
-    command = (
-        "python checks/train.py dataset=check_1 model=lnn data=multi_step model/friction=coulomb"
-    )
+    command = "python checks/train.py dataset=check_1 model=lnn model/friction=coulomb"
     assert _training(["model/friction=coulomb"]) == command
 
 
@@ -131,7 +129,7 @@ def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):
 
 def test_a_structure_of_another_robot_is_refused_by_name(tmp_path):
     error = fails("check.py", *arguments(tmp_path), *structure("emps"))
-    assert "the columns q1, q2, and model.structure the joints screw" in str(error.code)
+    assert "the columns q1, q2, and the structure the joints screw" in str(error.code)
 
 
 def test_known_kinematics_add_what_the_motion_tells_of_the_bodies(tmp_path, capsys):

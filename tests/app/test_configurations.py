@@ -203,14 +203,14 @@ HNN_ON_A_LOG = ["experiment=example_log", "model=hnn", "compile=false", *TINY_TR
 def test_a_hamiltonian_network_on_velocities_trains_on_a_log(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     folder = tmp_path / "run"
-    choices = ["model.state=qv", NO_FIGURES, f"hydra.run.dir={folder}"]
+    choices = [NO_FIGURES, f"hydra.run.dir={folder}"]
     run_script("train.py", *HNN_ON_A_LOG, *choices)
     assert_trained(folder)
 
 
 def test_a_hamiltonian_network_on_momenta_is_told_how_to_do_without(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    words = [*HNN_ON_A_LOG, f"hydra.run.dir={tmp_path / 'run'}"]
+    words = [*HNN_ON_A_LOG, "model.state=qp", f"hydra.run.dir={tmp_path / 'run'}"]
     assert "set model.state=qv" in refused_text(capsys, "train.py", *words)
 
 

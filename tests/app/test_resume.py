@@ -109,9 +109,10 @@ def test_a_resumed_training_equals_an_uninterrupted_one(run, tmp_path):
         assert first["global_step"] == second["global_step"]
         for key, value in first["state_dict"].items():
             assert torch.equal(value, second["state_dict"][key]), key
-    names = {"val/error_mean", "val/error_windowed", "train/loss"}
-    for name in names:
-        assert resumed.metrics["validation"][name] == whole.metrics["validation"][name]
+    for name in ("val/error_mean", "val/error_windowed", "train/loss"):
+        assert resumed.metrics["last_validation"][name] == whole.metrics["last_validation"][name]
+    for name in ("validation", "kept_step"):
+        assert resumed.metrics[name] == whole.metrics[name]
 
 
 def test_a_finished_training_is_not_repeated(run, monkeypatch):

@@ -129,7 +129,7 @@ def test_the_rate_in_an_hdf5_file_without_clock_is_named(tmp_path):
     with h5py.File(tmp_path / "run.h5", "a") as file:
         del file["log/t"]
         file["log"].attrs["fps"] = 100
-    with pytest.raises(LogError, match=r"write time: \{rate: 100\}.*log/q \(601, 2\).*log@fps"):
+    with pytest.raises(LogError, match=r"write time=\{'rate': 100\}.*log/q \(601, 2\).*log@fps"):
         source(tmp_path, **HDF5).load()
     assert_read(source(tmp_path, **HDF5 | {"time": {"rate": 100}}), TABLE)
 

@@ -9,6 +9,7 @@ import yaml
 from hydra.utils import instantiate
 from scipy.ndimage import gaussian_filter1d
 
+import pinn_dyn
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs import LogError, LogSource
 
@@ -52,6 +53,8 @@ def spike(column):
 
 
 def append(step):
+    if step.startswith("pinn_dyn"):
+        return {"steps": {"new": eval(step, {"pinn_dyn": pinn_dyn})}}
     return {"steps": {"new": instantiate(yaml.safe_load(step))}}
 
 
@@ -115,11 +118,12 @@ ADVICE = {
         changed(w=np.gradient(table()["q"], 0.01)), MEASURED, r"leave out (\w+), or v",
         lambda _: (changed(w=np.gradient(table()["q"], 0.01)), MEASURED | {"steps": {}}),
     ),
-    "spike of q": (spike("q"), {}, r"Add the step (.*?}), or", lambda x: (spike("q"), append(x))),
-    "spike of u": (spike("u"), {}, r"Add the step (.*?}), or", lambda x: (spike("u"), append(x))),
+    "spike of q": (spike("q"), {}, r"Add the step (.*?), or", lambda x: (spike("q"), append(x))),
+    "spike of u": (spike("u"), {}, r"Add the step (.*?), or", lambda x: (spike("u"), append(x))),
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("language")
 @pytest.mark.parametrize("name", ADVICE)
 def test_the_advice_repairs_the_log_or_its_description(name):
     files, description, pattern, follow = ADVICE[name]

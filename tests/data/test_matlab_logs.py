@@ -134,7 +134,7 @@ def test_a_scalar_rate_is_no_sample_time_and_the_advice_works(tmp_path):
     description = {**named("{}_{}"), "time": dict(columns="fs", unit="s")}
     with pytest.raises(LogError, match="fs is a rate") as error:
         source(tmp_path, files="run.mat", **description).load()
-    rate = float(re.search(r"write time: \{rate: (.*?)\}", str(error.value))[1])
+    rate = float(re.search(r"write time=\{'rate': (.*?)\}", str(error.value))[1])
     assert_read(source(tmp_path, files="run.mat", **description | {"time": {"rate": rate}}), TABLE)
 
 
@@ -181,8 +181,8 @@ def test_times_or_states_at_both_ends_of_the_steps(tmp_path, longer):
     [
         (dict(u=U + 1j), r"'u_1' is of complex128 \(601, 2\).*q \(601, 2\)"),
         (dict(u=U[::10]), r"'u_1' is of float64 \(61, 2\), expected real numbers in 601 rows"),
-        (dict(t=np.empty(0), fs=100.0), r"no variable 't'.*write time: \{rate: 100.0\}.*fs = 100"),
-        (dict(t=np.empty(0), Ts=0.01, Generate=1.0), r"no variable 't'.*rate: 100\}.*Ts = 0.01"),
+        (dict(t=np.empty(0), fs=100.0), r"no variable 't'.*write time=\{'rate': 100.0\}.*fs = 100"),
+        (dict(t=np.empty(0), Ts=0.01, Generate=1.0), r"no variable 't'.*rate': 100\}.*Ts = 0.01"),
     ],
 )
 def test_variables_that_do_not_fit_are_named_with_their_sizes(tmp_path, changes, message):

@@ -1,5 +1,7 @@
 """The check of a log: measurements with verdicts, and the two steps that it measures."""
 
+import functools
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,10 +9,13 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+import pinn_dyn
 from pinn_dyn.data.bandwidth import bandwidth
 from pinn_dyn.data.logs import Butterworth, LogSource, MovingAverage, Recording
 from pinn_dyn.log_check.averages import white_noise
 from pinn_dyn.log_check.check import check
+from pinn_dyn.models import CoulombFriction
+from pinn_dyn.wording import command_line
 from tests.support.delayed_robots import resting
 
 RATE = 100.0
@@ -110,15 +115,30 @@ def test_no_filter_smears_dry_friction_where_v_is_measured():
     for v in (None, dict(columns=["v1", "v2"], unit="m/s")):
         result = checked(frame, v=v)
         assert options(result)
-        assert any(x.startswith("filter") for x in result.steps) == (v is None)
+        assert any("Butterworth" in x for x in result.steps) == (v is None)
 
 
-def test_the_block_to_copy_extends_the_data_set():
+def test_the_options_of_a_training_are_a_model_in_python():
+    item = resting(0.3)
+    columns = {f"{x}{k + 1}": y[:, k] for x, y in (("q", item.q), ("u", item.u)) for k in range(2)}
+    (advice,) = checked(pd.DataFrame({"t": item.t, **columns})).advice
+    text = advice.partition(": ")[2]
+    model = eval(f"dict({text})", {"functools": functools, "pinn_dyn": pinn_dyn})["model"]
+    assert model.keywords == {"friction": CoulombFriction}
+
+
+def test_the_block_to_copy_extends_the_data_set(language):
     frame = driven(delay=0.05, noise=0.005)
     for steps in ({}, {"first": MovingAverage(3)}):
         result = checked(frame, steps=steps)
         text = "name: masses\n" + ("steps:\n  first: {window: 3}\n" if steps else "")
-        entries = yaml.safe_load(f"{text}{result.block}\n")
+        if language == "yaml":
+            entries = yaml.safe_load(f"{text}{result.block}\n")
+        else:  # arguments, or behind the steps that there are
+            block = result.block.replace("delay", "), delay") if steps else result.block
+            text = f"dict({'cleaning=dict(first=1,' if steps else ''}\n{block}\n)"
+            entries = eval(text, {"pinn_dyn": pinn_dyn})
+            entries["steps"] = entries.pop("cleaning")
         assert entries["delay"] == result.delay
         assert len(entries.get("steps", {})) == 1
 
@@ -126,11 +146,11 @@ def test_the_block_to_copy_extends_the_data_set():
 def test_noise_is_measured_and_gives_a_filter_above_the_motion():
     result = checked(driven(noise=0.005))
     assert result.coordinates["noise of q"].to_numpy() == pytest.approx([0.005] * 2, rel=0.1)
-    (line,) = [x for x in result.steps if x.startswith("filter")]
-    cutoff = float(line.split("cutoff: ")[1].split("}")[0])
+    (line,) = [x for x in result.steps if "Butterworth" in x]
+    cutoff = float(line.split("cutoff=")[1].split(")")[0])
     assert 2.0 < cutoff < 20.0
     again = checked(driven(noise=0.005), steps={"smooth": Butterworth(cutoff)})
-    assert not any(x.startswith("filter") for x in again.steps)
+    assert not any("Butterworth" in x for x in again.steps)
 
 
 def test_inputs_of_another_robot_stop_a_training(good):
@@ -203,7 +223,9 @@ def test_inputs_in_the_unit_of_the_coordinates_are_no_targets_if_the_robot_does_
     result = checked(driven(), **signals)
     assert "model/input=servo" not in options(result)
     assert result.candidates[0][1] == ["experiment=oscillators"]
-    assert "experiment=oscillators" in str(result)
+    assert "model='oscillators'" in str(result)
+    with command_line():
+        assert "experiment=oscillators" in str(result)
 
 
 KINDS = {

@@ -207,7 +207,7 @@ PLANTED = {
         FIT,
         ["inputs of the joints joint0"],
     ),
-    "clock 2 %": (lambda: edited(clock(0.02)), False, DRIFT, ["'u1' drifts by 2 %", "too early"]),
+    "clock 2 %": (lambda: edited(clock(0.02)), False, DRIFT, ["'u1' drifts by", "too early"]),
     "drive saturates": (lambda: edited(commanded), False, SATURATED, ["'u2' is a command"]),
     "v late": (lambda: edited(late_velocity), False, "lag of v [ms]", ["30 ms behind"]),
     "next state": (lambda: edited(next_state), False, NEXT, ["'u1'", "'u2'", "'u3'"]),

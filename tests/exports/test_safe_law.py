@@ -214,6 +214,19 @@ def test_a_guard_over_an_observer_acts_in_the_loop_as_in_the_file(guarded_observ
         assert status == 2 * (k in (5, 6))
 
 
+@pytest.mark.parametrize("kind", [np.array, functools.partial(torch.tensor, dtype=torch.float64)])
+def test_limits_may_be_arrays_and_tensors(law, tmp_path, kind):
+    limits = {"low": [-0.1, -0.2, -0.3], "high": [0.1, 0.2, 0.3], "rate": 10.0}
+    given = {name: kind(value) for name, value in limits.items()}
+    path = tmp_path / "law.c"
+    calls = [with_memory(in_file(law, path, actuator=Actuator(**x))) for x in (limits, given)]
+    states = [[x.numpy() for x in state] for state in zip(*motion(20), strict=True)]
+    inputs = [[call(*state)[0] for state in states] for call in calls]
+    assert np.array_equal(*inputs)
+    assert np.abs(inputs[0]).max(axis=0) == pytest.approx(limits["high"])
+    assert "limits" in path.with_suffix(".h").read_text()
+
+
 def test_the_first_input_is_limited_from_zero(law, tmp_path):
     control = with_memory(in_file(law, tmp_path / "law.c", actuator=Actuator(rate=10.0)))
     u, status = control(*[10 * np.ones(3), *[np.zeros(3)] * 4])

@@ -44,6 +44,21 @@ def hard(s, v):
     return min(max(s, -ends[1]), ends[0])
 
 
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_limits_may_be_arrays_and_tensors(kind):
+    numbers, v = [3.0, 4.0], torch.tensor([[0.5, -0.5]])
+    drives = [
+        DriveLimits(unit_scales(2), limit=values, stall=values, no_load_speed=values)
+        for values in (numbers, kind(numbers))
+    ]
+    servos = [
+        Servo(unit_scales(2), stiffness=values, limit=values) for values in (numbers, kind(numbers))
+    ]
+    force = torch.tensor([[10.0, -10.0]])
+    assert torch.equal(*(drive(force, v) for drive in drives))
+    assert torch.equal(*(servo.largest_force() for servo in servos))
+
+
 def recording(seed, seconds=20.0, rate=200.0, loss=0.0, scale=1.5, limited=hard):
     """Commands of a stiff controller on sines that ask for more than the drive has."""
     generator, step = np.random.default_rng(seed), 1 / rate / 5

@@ -2,15 +2,15 @@
 
 import dataclasses
 import math
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
-from pinn_dyn.models import (
-    KnownMechanics,
-)
+from pinn_dyn.models import ElasticJoints, KnownMechanics, KnownSystem
 from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
-from pinn_dyn.systems import RigidChain
+from pinn_dyn.systems import RigidChain, SoftArm
 from pinn_dyn.systems.inertia import inertial_parameters
 from pinn_dyn.testing import MechanicalSystemContract
 from tests.support.contracts import one_case
@@ -35,6 +35,28 @@ def test_the_prior_start_is_the_urdfs_robot():
     drives = model.armature() * a + model.viscous() * v - model.offset()
     expected = chain.inverse_dynamics(q, v, a) + drives
     assert torch.allclose(model.inverse_dynamics(q, v, a), expected, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        partial(KnownMechanics, structure=RigidChain(TREE, locked_joints=["wrist"])),
+        partial(KnownMechanics, structure=ElasticJoints(RigidChain(TREE, locked_joints=["wrist"]))),
+        partial(KnownSystem, structure=SoftArm()),
+    ],
+    ids=["rigid", "elastic", "system"],
+)
+def test_the_structure_of_the_caller_stays_as_it_is(build):
+    structure = build.keywords["structure"]
+    before = {name: value.clone() for name, value in structure.named_buffers()}
+    drives = 3 if isinstance(structure, SoftArm) else 4
+    inputs = {"u_mean": torch.zeros(drives), "u_std": torch.ones(drives)}
+    build(replace(statistics(structure.num_coordinates), **inputs)).half()
+    assert before
+    assert all(
+        value.dtype == torch.float64 and torch.equal(value, before[name])
+        for name, value in structure.named_buffers()
+    )
 
 
 def test_springs_store_half_k_times_the_square_of_their_stretch():

@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 
 _MOST_NAMES = 30
+TRAJECTORY = "'trajectory' (run=... of pinn_dyn.fit)"
+"""Name of the setting that tells runs apart, for messages."""
 
 
 class LogError(ValueError):

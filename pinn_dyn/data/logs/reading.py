@@ -11,7 +11,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs.check.checks import check_clock, check_rows
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.errors import TRAJECTORY, LogError, listed
 from pinn_dyn.data.logs.filling import fill
 from pinn_dyn.data.logs.joining import joined, widened
 from pinn_dyn.data.logs.readers import find_files, read_tables, run_name
@@ -108,7 +108,7 @@ class Layout:
                 if len(starts):
                     cure = (
                         f"a run is assumed to start there ({len(starts)} such rows); name a column "
-                        "of the runs in 'trajectory'"
+                        f"of the runs in {TRAJECTORY}"
                     )
                 report.warn("clock", f"{text}: {cure}")
             rows, t = rows[order], t[order]

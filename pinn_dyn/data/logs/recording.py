@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 
@@ -19,7 +20,7 @@ _CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
 
 
 def clock_steps(t: np.ndarray) -> str:
-    """Return the block ``steps`` in YAML that gives a run of times ``(T,)`` in s a uniform clock.
+    """Return the steps that give a run of times ``(T,)`` in s a uniform clock.
 
     The rate is round, near the usual one. SplitGaps leaves no gap that Resample would refuse.
     """
@@ -28,17 +29,17 @@ def clock_steps(t: np.ndarray) -> str:
     rate = round_rate(usual)
     digit = 10 ** (np.floor(np.log10(_LONGEST_GAP * usual)) - 1)
     gap = digit * np.ceil(_LONGEST_GAP * usual / digit)
-    name = "_target_: pinn_dyn.data.logs"
-    steps = [f"deduplicate: {{{name}.Deduplicate}}"] if (spacing == 0).any() else []
-    steps += [
-        f"split_gaps: {{{name}.SplitGaps, longest: {gap:.3g}}}",
-        f"resample: {{{name}.Resample, rate: {rate:.6g}, max_gap: {gap:.3g}}}",
+    gap, rate = float(f"{gap:.3g}"), float(f"{rate:.6g}")
+    lines = [wording.line("deduplicate", wording.step("Deduplicate"))] * int(0 in spacing)
+    lines += [
+        wording.line("split_gaps", wording.step("SplitGaps", longest=gap)),
+        wording.line("resample", wording.step("Resample", rate=rate, max_gap=gap)),
     ]
-    return "\n  ".join(["\n\nsteps:", *steps])
+    return f"\n\n{wording.steps(lines)}"
 
 
-def burst_steps(t: np.ndarray) -> dict[str, str]:
-    """Return the steps in YAML that repair stamps in bursts, ``(T,)`` in s, by their names.
+def burst_steps(t: np.ndarray) -> list[str]:
+    """Return lines with the steps that repair stamps in bursts, ``(T,)`` in s.
 
     The rate is that of the rows between gaps, which are longer than usual bursts; it is round if
     the stamps allow it.
@@ -52,12 +53,12 @@ def burst_steps(t: np.ndarray) -> dict[str, str]:
     rounded = float(f"{rate:.3g}")
     distance = written - rows / rounded
     rate = rounded if np.ptp(distance) < 3 * burst else rate
-    name = "_target_: pinn_dyn.data.logs"
-    steps = {"row_clock": f"{{{name}.RowClock, rate: {rate:.7g}, longest: {2 * burst:.2g}}}"}
+    step = wording.step("RowClock", rate=float(f"{rate:.7g}"), longest=float(f"{2 * burst:.2g}"))
+    lines = [wording.line("row_clock", step)]
     if not inside.all():
-        gap = _GAP_BURSTS * burst
-        return {"split_gaps": f"{{{name}.SplitGaps, longest: {gap:.2g}}}", **steps}
-    return steps
+        longest = float(f"{_GAP_BURSTS * burst:.2g}")
+        lines.insert(0, wording.line("split_gaps", wording.step("SplitGaps", longest=longest)))
+    return lines
 
 
 def round_rate(sample_time: float) -> float:

@@ -11,6 +11,7 @@ import pandas as pd
 from pydantic import PositiveFloat
 from pydantic.dataclasses import dataclass
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.columns import STRICT, UNITS, Columns, PerColumn
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.table import Table
@@ -47,7 +48,8 @@ class Clock(Columns):
         if self.rate is not None:
             self.columns, self.unit = [], []
         elif not self.columns:
-            raise LogError("expected columns, or a rate, as in time: {rate: 100}")
+            rate = wording.entry("time", {"rate": 100})
+            raise LogError(f"expected columns, or a rate, as in {rate}")
         super().__post_init__()
         self.check_units("time", ["s"])
 
@@ -97,8 +99,9 @@ class Clock(Columns):
         try:
             raw = table.column(name, "time")
         except LogError as error:
-            text = "Without a clock, state the rate in Hz instead, as in time: {rate: 100}"
-            raise LogError(f"{error}. {text}") from None
+            rate = wording.entry("time", {"rate": 100})
+            text = f"{error}. Without a clock, state the rate in Hz instead, as in {rate}"
+            raise LogError(text) from None
         cells = raw
         if raw.dtype.kind not in "mM":
             numbers = pd.to_numeric(raw, errors="coerce")

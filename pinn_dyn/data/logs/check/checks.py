@@ -8,8 +8,9 @@ from collections.abc import Collection
 import numpy as np
 import scipy
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import TRAJECTORY, LogError
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import burst_steps, clock_steps
 from pinn_dyn.data.logs.registers import check_registers
@@ -54,11 +55,14 @@ def check_clock(
     if clock.rate is not None:
         return []
     spacing = np.diff(t)
-    rate = "state the rate in Hz instead, as in time: {{rate: {:.4g}}}"
+
+    def rate(value: float) -> str:
+        text = wording.entry("time", {"rate": float(f"{value:.4g}")})
+        return f"state the rate in Hz instead, as in {text}"
+
     if not (spacing > 0).any():
         raise LogError(
-            f"{table.place(0, clock.name)}: the time never increases in this run: "
-            + rate.format(100)
+            f"{table.place(0, clock.name)}: the time never increases in this run: " + rate(100)
         )
     typical = float(spacing.mean() if "bursts" in repairs else np.median(spacing[spacing > 0]))
     low, high = SAMPLE_TIMES
@@ -70,20 +74,19 @@ def check_clock(
         raise LogError(
             f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s in a "
             f"run of {np.ptp(t):.4g} s, expected {low:g} to {high:g} s: "
-            f"{cure}{rate.format(shared / typical)}"
+            f"{cure}{rate(shared / typical)}"
         )
     same = spacing == 0
     if same.any():  # a logger that is faster than its source repeats whole rows
         same[same] = table.frame.duplicated().to_numpy()[1:][same]
     bursts = _burst_share(t[np.r_[True, ~same]])
     steps = f"as in{clock_steps(t)}"
-    split = "name the column that tells runs apart in 'trajectory' (run=... of pinn_dyn.fit)"
+    split = f"name the column that tells runs apart in {TRAJECTORY}"
     once = f"add a Deduplicate step, which keeps the first row, {steps}"
     fill = f"split long gaps and interpolate over short ones, {steps}"
     in_bursts = bursts > _BURSTS
     if in_bursts:
-        entries = [f"  {name}: {step}" for name, step in burst_steps(t).items()]
-        once = fill = "\n".join([f"{_BURST_TEXT}, as in\n\nsteps:", *entries])
+        once = fill = f"{_BURST_TEXT}, as in\n\n{wording.steps(burst_steps(t))}"
     for fault, rows, problem, cure in (
         ("backward times", spacing < 0, "goes back", split),
         ("repeated times", spacing == 0, "repeats", once),
@@ -98,8 +101,7 @@ def check_clock(
             )
     bad = in_bursts and "bursts" not in repairs
     expected = f"below {_BURSTS}"
-    steps = ", ".join(f"{name}: {step}" for name, step in burst_steps(t).items())
-    text = f"{table.name}: {_BURST_TEXT} first among the steps, as {steps}"
+    text = f"{table.name}: {_BURST_TEXT}, first of the steps: {' '.join(burst_steps(t))}"
     return [judged("share of rows in bursts", table.name, bursts, expected, bad, text)]
 
 
@@ -155,7 +157,7 @@ def _check_angle(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.
     if alternates(q):
         raise LogError(
             f"{table.place(1, name, 'q')}: rows go to and fro by {abs(q[1] - q[0]):.4g} {unit}: "
-            "two runs share the clock; name the column that tells them apart in 'trajectory'"
+            f"two runs share the clock; name the column that tells them apart in {TRAJECTORY}"
         )
 
 
@@ -176,12 +178,13 @@ def _jumps(
     row = first + 1 if steps else first
     if _are_ticks(distance[bad]) and table.frame[name].iloc[row] not in _NO_VALUE:
         return ""
+    threshold = float(f"{distance[first] / 2:.2g}")
+    repair = wording.step("RemoveJumps", threshold=threshold, window=5, signals=[signal])
     return (
         f"{table.place(row, name, signal)}: a {'jump' if steps else 'spike'} to {x[row]:.5g} "
         f"{unit}, {distance[first]:.3g} from the value that its neighbors make likely "
         f"({int(bad.sum())} such rows in this run): does it stand for 'no value'? Add the step "
-        f"{{_target_: pinn_dyn.data.logs.RemoveJumps, threshold: {distance[first] / 2:.2g}, "
-        f"window: 5, signals: [{signal}]}}, or name a new run that begins there in 'trajectory'"
+        f"{repair}, or name a new run that begins there in {TRAJECTORY}"
     )
 
 

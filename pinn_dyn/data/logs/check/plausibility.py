@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import scipy
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.check.holds import held_rows
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
@@ -95,10 +96,12 @@ def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measur
         share, part = (sizes < slow).all(axis=1).mean(), "training" if name == "train" else name
         text = f"the robot is at rest for {100 * share:.0f} % of the {part} samples: "
         if name == "train":
-            text += "windows drawn there teach little; use data.coverage, or cut the rest out"
+            coverage = wording.setting("data.coverage", 1.0)
+            text += f"windows drawn there teach little; use {coverage}, or cut the rest out"
         else:
             text += (
-                f"errors there tell little of a model; take another part or run for dataset.{part}"
+                "errors there tell little of a model; take another part or run for "
+                f"{wording.setting(f'dataset.{part}')}"
             )
         stop = name == "train" and share > _ALL_AT_REST
         verdict: Verdict = "stop" if stop else "warning"

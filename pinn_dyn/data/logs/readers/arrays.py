@@ -18,12 +18,12 @@ import numpy as np
 import pandas as pd
 import torch
 
+from pinn_dyn import wording
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.readers.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional, vector_columns
 from pinn_dyn.spelling import did_you_mean
 
-_FEW_RUNS = 3  # that may as well be the axes X, Y and Z of points
 _KINDS = "fiubmMUTO"  # of arrays that may be columns
 _RATE = re.compile(r"(^|[._@/])(fs|fps|hz|(sampl\w*?)?_?(rate|freq\w*)(_hz)?)$", re.IGNORECASE)
 
@@ -177,17 +177,7 @@ def _nested(name: str, content: Any) -> Iterator[tuple[str, Any]]:
 
 def _tables(path: Path, request: Request, variables: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     runs = _runs(variables, request)
-    tables = {run: table_of_arrays(path, request, values) for run, values in runs.items()}
-    for name in {y for x in request.columns for y in (x, x.rpartition("_")[0])} & {*variables}:
-        shape = variables[name].shape
-        if len(shape) == 3 and len(runs) == shape[1] <= _FEW_RUNS:
-            text = (
-                f"{name!r} of shape {shape} is taken as {shape[1]} runs; save coordinates as an "
-                f"array of shape ({shape[0]}, {shape[1] * shape[2]})"
-            )
-            for table in tables.values():
-                table.attrs["notes"] = [*table.attrs.get("notes", []), text]
-    return tables
+    return {run: table_of_arrays(path, request, values) for run, values in runs.items()}
 
 
 def _runs(variables: Mapping[str, Any], request: Request) -> dict[str, dict[str, Any]]:
@@ -263,7 +253,8 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
         if name in scalars and name == request.time:
             columns[name] = scalars[name] * np.arange(samples)
             if _RATE.search(name):
-                problem = f"{name} is a rate: write time: {{rate: {scalars[name]}}}."
+                setting = wording.entry("time", {"rate": scalars[name]})
+                problem = f"{name} is a rate: write {setting}."
         elif name not in columns and base:
             problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
             problem += f"real numbers in {samples} rows."
@@ -272,7 +263,7 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
             run = next((f", write {x!r}, and so on." for x in runs if "*" in x), ".")
             problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or run} "
             rate = next((y for x, y in scalars.items() if _RATE.search(x)), 100)
-            problem += f"Without a clock write time: {{rate: {rate}}}, in Hz."
+            problem += f"Without a clock write {wording.entry('time', {'rate': rate})}, in Hz."
         if problem:
             raise LogError(f"{path}: {problem} The file has {listed(sizes)}")
     table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))

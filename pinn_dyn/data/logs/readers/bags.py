@@ -23,6 +23,7 @@ from pinn_dyn.data.logs.table import Request, Table, alternates
 # Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
 _NAMES = ("name", "joint_names", "interface_names")
 _LATEST = 1.0  # s; a message that is later than this begins a new run
+_REGULAR = 0.05  # share of messages that come early, of one publisher
 _FEW = 20  # messages from which two publishers can be told
 _RECEIVED = ""  # column of the times of receipt
 
@@ -125,15 +126,12 @@ def _topic(
         if field.isdigit() and len(joined) > 1:
             turns = f"is of {listed(joined)} by turns"
             raise LogError(f"{path}: {column!r} {turns}: write {column[: -len(field)]}{joined[0]}")
-    publishers, orders = _publishers(publishers, joints)
+    publishers, orders = _publishers(publishers, joints, times)
     usual = pd.Series(publishers[~foreign]).mode()[0]
     for reason, mask in (
         ("with stamp 0", zero),
         (f"of {listed(sorted(set().union(*joints[foreign])))}", foreign),
-        (
-            f"of another publisher{orders}, record without it,",
-            ~foreign & ~zero & (publishers != usual),
-        ),
+        (f"of another publisher{orders}", ~foreign & (publishers != usual)),
     ):
         if mask.any():
             notes.append(f"{mask.sum()} of {len(rows)} messages of {topic} {reason} are dropped")
@@ -149,20 +147,30 @@ def _topic(
     return frame
 
 
-def _publishers(publishers: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, str]:
+def _publishers(
+    publishers: np.ndarray, joints: np.ndarray, times: np.ndarray
+) -> tuple[np.ndarray, str]:
     """Return numbers of the publishers of messages, and the orders of joints that tell them apart.
 
-    Nodes that share a connection are told apart by the order of the joints, if it changes to and
-    fro.
+    Nodes that share a connection are told apart by the order of the joints, if the messages of one
+    order come at regular times, and those of all do not.
     """
     orders = list(dict.fromkeys(x for x in joints if x))
     numbers = np.array([orders.index(x) if x else 0 for x in joints])
-    same = len({frozenset(x) for x in orders}) == 1 < len(orders)
-    if not same or np.count_nonzero(np.diff(numbers)) < _FEW:
-        return publishers, ""
     counts = np.bincount(numbers)
+    if len({frozenset(x) for x in orders}) != 1 or len(orders) < 2 or counts.min() < _FEW:
+        return publishers, ""
+    irregular = [_early(times[mask]) for mask in (numbers >= 0, numbers == counts.argmax())]
+    if irregular[0] < _REGULAR or irregular[1] > _REGULAR:
+        return publishers, ""
     texts = [f"{count} of {', '.join(x)}" for x, count in zip(orders, counts, strict=True)]
     return publishers * len(orders) + numbers, f" ({' and '.join(texts)})"
+
+
+def _early(times: np.ndarray) -> float:
+    """Return the share of messages that follow within half of the usual time."""
+    spacing = np.diff(np.sort(times))
+    return float((spacing < np.median(spacing) / 2).mean())
 
 
 def _merged(topics: Sequence[pd.DataFrame], last: str) -> pd.DataFrame:
