@@ -14,7 +14,6 @@ import pandas as pd
 
 from pinn_dyn import wording
 from pinn_dyn.data import logs
-from pinn_dyn.data.logs.check.averages import PARTS, Averages
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.report.page import (
@@ -28,6 +27,8 @@ from pinn_dyn.evaluation.report.page import (
     table,
 )
 from pinn_dyn.identification.rigid_excitation import RigidExcitation
+from pinn_dyn.log_check.delay import DelayCurve
+from pinn_dyn.log_check.runs import Motion
 from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels
 from pinn_dyn.whole import write_whole
 
@@ -64,13 +65,10 @@ class LogCheck:
         delays: delay curve of each input.
         steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
         delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
-        options: options of a training: heads for dry friction or servos, or the settings of
-            oscillators, if needed; none if an angle turns too far in a sample for a step.
-        model: model of a training: oscillators for inputs that are positions or pressures of
-            motors, which the coordinates do not follow, of a robot without a structure; else lnn.
+        candidates: models of a training, each with the reason and its options.
+        driven: number of the joint that each input drives, of fewer inputs than coordinates.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
-        motion: averages of the motion, or None if it is too short for an equation of motion.
-        equations: equations of motion of the log.
+        motion: averages and equations of motion; None if there are too few rows for an equation.
     """
 
     source: logs.LogSource
@@ -78,14 +76,13 @@ class LogCheck:
     runs: pd.DataFrame
     coordinates: pd.DataFrame
     inputs: pd.DataFrame
-    delays: list[logs.DelayCurve]
+    delays: list[DelayCurve]
     steps: list[str]
     delay: float | list[float] | None
-    options: list[str]
-    model: str = "lnn"
+    candidates: list[tuple[str, list[str]]]
+    driven: Sequence[int] = ()
     rigid: RigidExcitation | None = None
-    motion: Averages | None = None
-    equations: Sequence[logs.Equation] = ()
+    motion: Motion | None = None
 
     @property
     def problems(self) -> list[str]:
@@ -93,20 +90,9 @@ class LogCheck:
         return [x.text for x in self.measurements if x.verdict == "stop"]
 
     @property
-    def advice(self) -> str:
-        """Model and options of a training."""
-        options = shlex.join(self.options)
-        if self.model == "lnn":
-            options = f"model=lnn {options}"
-        if not wording.IN_YAML.get():
-            heads = "".join(f", {_HEADS.get(option)}" for option in self.options)
-            options = f"model=functools.partial(pinn_dyn.models.LagrangianNetwork{heads})"
-        if self.model == "lnn":
-            return f"Options of a training: {options}"
-        return (
-            "The inputs are positions or pressures of motors, no forces: a soft robot has more "
-            f"modes than coordinates. Options of a training: {wording.setting('model', self.model)}"
-        )
+    def advice(self) -> list[str]:
+        """Models of a training with their reasons and options, one in a line."""
+        return [f"A training, as {why}: {_options(x)}" for why, x in self.candidates]
 
     @property
     def warnings(self) -> list[str]:
@@ -168,8 +154,8 @@ class LogCheck:
         lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
         if self.block:
             lines += ["", "Append to the data set:", "", self.block]
-        if self.options and self.rigid is None:
-            lines += ["", self.advice]
+        if self.rigid is None and not self.problems:
+            lines += ["", *self.advice]
         return "\n".join(lines)
 
     def save(self, folder: str | Path, command: str = "") -> Path:
@@ -182,6 +168,17 @@ class LogCheck:
         return folder / "check.html"
 
 
+def _options(options: Sequence[str]) -> str:
+    """Return the options of a training, on the command line or in Python."""
+    if wording.IN_YAML.get():
+        return shlex.join(options)
+    name = options[0].partition("=")[2]
+    if name != "lnn":
+        return wording.setting("model", name)
+    heads = "".join(f", {_HEADS[option]}" for option in options[1:])
+    return f"model=functools.partial(pinn_dyn.models.LagrangianNetwork{heads})"
+
+
 def _cause(text: str) -> str:
     """Return the part of a text that names a cause, without names and numbers of its place."""
     return re.sub(r"[\d.]+|\S*[/\\']\S*", "", text.rpartition(": ")[2])
@@ -191,15 +188,15 @@ def check_report(check: LogCheck, *, command: str) -> str:
     """Return the HTML page of a check: verdict, forces, what is not ok, and the rest folded."""
     source = check.source
     verdict = [paragraph(f"{check.verdict[0].upper()}{check.verdict[1:]}.")]
-    if check.equations and check.motion is not None:
+    if check.motion is not None:
         text = "measured forces, the part that the equation of motion explains, and the residual"
         verdict += [paragraph(_FORCES), drawing(_forces(check), text)]
     verdict += [paragraph(text) for text in check.findings()]
     if check.block:
         text = "Entries that follow from the measured delay and noise, to append to the data set:"
         verdict += [paragraph(text), preformatted(check.block)]
-    if check.options and check.rigid is None:
-        verdict.append(paragraph(check.advice))
+    if check.rigid is None and not check.problems:
+        verdict += [paragraph(text) for text in check.advice]
     cleaning = cleaning_figure(
         source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
     )
@@ -229,13 +226,13 @@ def check_report(check: LogCheck, *, command: str) -> str:
 def _forces(check: LogCheck) -> Figure:
     """Draw y, X theta and the residual of each equation of motion in the longest run."""
     assert check.motion is not None
-    runs, counts = np.unique(check.motion.block // PARTS, return_counts=True)
-    rows = np.flatnonzero(check.motion.block // PARTS == runs[counts.argmax()])[:_DRAWN]
-    t = check.motion.t[rows]
+    data = check.motion.data
+    rows = np.flatnonzero(data.run == np.bincount(data.run).argmax())[:_DRAWN]
+    t = data.t[rows]
     breaks = np.flatnonzero(np.diff(t) > 10 * np.median(np.diff(t))) + 1  # between stretches
-    pairs = [equation.predicted() for equation in check.equations]
+    pairs = [equation.predicted() for equation in check.motion.equations]
     measured, explained = (np.hstack(x)[rows] for x in zip(*pairs, strict=True))
-    labels = [label for equation in check.equations for label in equation.labels]
+    labels = [label for equation in check.motion.equations for label in equation.labels]
     figure, (axes,) = panels([labels], t, title="Forces and the equation of motion, means removed")
     curves = {
         "measured": (measured, TRUTH),

@@ -17,6 +17,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.columns import known_unit
@@ -34,6 +35,7 @@ _NUMBERS = {
     for mark in ".,"
 }
 _NUMBER = {mark: re.compile(text, re.ASCII | re.IGNORECASE) for mark, text in _NUMBERS.items()}
+_FRAME, _TIME = "Frame", "Time"  # columns of motion capture
 _ITEM = rf"(?:{_NUMBERS['.']}|nan)"
 _BRACKETS = rf"[\[({{]\s*{_ITEM}(?:[\s,;]+{_ITEM})*[\s,;]*[\])}}]"
 _BARE_BRACKETS = re.compile(rf"(?<![^\s,;]){_BRACKETS}", re.IGNORECASE)
@@ -75,7 +77,7 @@ def read_text(path: Path, request: Request) -> Table:
     """
     content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
     text = _decoded(content).replace("\r\n", "\n").replace("\r", "\n")
-    text = one_header(text, request.columns)
+    text, rate = one_header(text, request.columns)
     if _BARE_BRACKETS.search(text, 0, 10_000):
         text = _BARE_BRACKETS.sub(r'"\g<0>"', text)
     lines = text.split("\n", _SAMPLE)[:_SAMPLE]
@@ -111,9 +113,26 @@ def read_text(path: Path, request: Request) -> Table:
         )
     frame.index = pd.RangeIndex(start + 1, len(frame) + start + 1)
     frame = _with_vectors(frame.dropna(how="all"), names)
+    if rate and _FRAME in frame:
+        frame, notes = _of_frames(frame, rate, notes)
     units = _units(lines[header + 1 : start], dialect, names)
     hint = "" if header >= 0 else ": it has no header, so its columns are numbered from 0."
     return Table(frame, str(path), "line", notes, units, hint)
+
+
+def _of_frames(
+    frame: pd.DataFrame, rate: float, notes: list[str]
+) -> tuple[pd.DataFrame, list[str]]:
+    """Return the rows with their time by the numbers of the frames, and a note on missing ones."""
+    numbers = frame[_FRAME].to_numpy(float)
+    missing = np.flatnonzero(np.diff(numbers) > 1)
+    if len(missing):
+        count = int((np.diff(numbers)[missing] - 1).sum())
+        text = f"{count} frames are missing, the first after frame {numbers[missing[0]]:g}"
+        notes = [*notes, f"{text}: time: {{columns: {_TIME}}} counts frames, not rows"]
+    if _TIME not in frame:
+        frame = frame.assign(**{_TIME: (numbers - numbers[0]) / rate})
+    return frame, notes
 
 
 def _decoded(content: bytes) -> str:
@@ -173,7 +192,8 @@ def _header(
                 best, names = score, candidate
     header = best[-1]
     names[0] = names[0] or "index"
-    if header < 0 and dialect.cells("".join(lines[first : first + 1])) == names:
+    numbers = dialect.cells("".join(lines[first : first + 1]))
+    if header < 0 and dialect.width > 1 and numbers == names:
         header, first = first, first + 1  # pandas numbers columns without names
     return names, header, first
 
