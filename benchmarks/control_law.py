@@ -29,7 +29,7 @@ from configured import build_model
 from hydra import compose, initialize_config_dir
 
 from pinn_dyn.app.config import CONF, resolved
-from pinn_dyn.control import Tracking, export_law
+from pinn_dyn.control import Pipeline, Tracking, export_law
 from pinn_dyn.control.export import INPUTS
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.predictor import double_copy
@@ -158,13 +158,14 @@ def main() -> None:
     torch.set_num_threads(1)
     model = load_run(arguments.run, "best").model if arguments.run else untrained()
     assert isinstance(model, MechanicalSystem)
-    eager = Tracking(double_copy(model), POSITION_GAIN, VELOCITY_GAIN)
+    eager = Pipeline(Tracking(double_copy(model), POSITION_GAIN, VELOCITY_GAIN))
 
     generator = torch.Generator().manual_seed(1)
     shape = (STATES, len(INPUTS), JOINTS)
     states = 4 * torch.rand(shape, generator=generator, dtype=torch.float64) - 2
     tensors = [tuple(x.clone() for x in state) for state in states]
-    memory = np.zeros(JOINTS)
+    memory = np.zeros(eager.memory_size)
+    start_memory = torch.from_numpy(memory)
     arrays = [tuple(x.numpy() for x in state) for state in tensors]
     with tempfile.TemporaryDirectory() as name, torch.inference_mode(False):
         folder, paths = Path(name), {}
@@ -200,9 +201,9 @@ def main() -> None:
             f"C, {' '.join(flags)}": timed_in_c(folder, flags, states, arguments.calls)
             for flags in (["-O3", "-march=native"], ["-O2"])
         }
-        calls |= {"eager": (eager.law, tensors)}
+        calls |= {"eager": (lambda *x: eager(*x, start_memory)[0], tensors)}
         with torch.inference_mode():
-            expected = torch.stack([eager.law(*x) for x in tensors]).numpy()
+            expected = torch.stack([eager(*x, start_memory)[0] for x in tensors]).numpy()
             errors = {}
             for name, (call, values) in calls.items():
                 difference = np.stack([np.asarray(call(*x)) for x in values]) - expected

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 import pandas as pd
 
 POSITION, VELOCITY, INTEGRAL = 0.3, 0.03, 10.0  # without a unit, s, 1/s
-DELAY = 0.01  # s
+DEAD_TIME = 0.01  # s
 COLUMNS = {
     "step_error_after_1_s_mean_percent": "mean [%]",
     "step_error_after_1_s_worst_percent": "worst [%]",
@@ -38,7 +38,7 @@ def closed_loop(run: str, factor: float, rate: float) -> dict[str, float]:
             "~controllers.pid",
             "~controllers.truth",
             f"rate={rate:g}",
-            f"delay={DELAY * rate:g}",
+            f"dead_time={DEAD_TIME:g}",
             f"gains.position={POSITION * factor:g}",
             f"gains.velocity={VELOCITY * factor:g}",
             f"controllers.learned.law.integral_gain={INTEGRAL * factor:g}",

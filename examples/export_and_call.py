@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import pinn_dyn
-from pinn_dyn.control import Actuator, Tracking, export_law
+from pinn_dyn.control import Actuator, Pipeline, Tracking, export_law
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("run", help="a run folder of model=lnn or hnn")
@@ -21,22 +21,23 @@ parser.add_argument("--file", type=Path, default=Path("law.c"), help="where the 
 args = parser.parse_args()
 
 run = pinn_dyn.load(args.run)
-eager = Tracking(run.system, position_gain=2.0, velocity_gain=0.2)
-export_law(eager, args.file, actuator=Actuator(low=-100.0, high=100.0))
+law = Tracking(run.system, position_gain=2.0, velocity_gain=0.2)
+pipeline = Pipeline(law, period=0.001, actuator=Actuator(low=-100.0, high=100.0))
+export_law(pipeline, args.file)
 library = args.file.resolve().with_suffix(".so")
 subprocess.run(["cc", "-O3", "-fPIC", "-shared", "-o", library, args.file, "-lm"], check=True)
-law = getattr(ctypes.CDLL(str(library)), f"{args.file.stem}_control")
+call = getattr(ctypes.CDLL(str(library)), f"{args.file.stem}_control")
 
 state = np.zeros((5, run.system.num_coordinates))  # q, v, q_ref, v_ref, a_ref
 state[2] = 0.1
-u, memory = np.zeros((2, run.system.num_inputs))  # the memory holds the last input
+u, memory = np.zeros(run.system.num_inputs), np.zeros(pipeline.memory_size)
 pointers = [ctypes.c_void_p(x.ctypes.data) for x in (*state, memory, u, memory)]
-status = law(*pointers)
+status = call(*pointers)
 print("u:", dict(zip(run.input_labels, u.round(4), strict=True)), "status:", status)
-expected = eager.law(*torch.from_numpy(state))
+expected, _, _ = pipeline(*torch.from_numpy(state), torch.zeros(len(memory)).double())
 print("the same as before the export:", np.allclose(u, expected, rtol=1e-9))
 
 start = time.perf_counter()
 for _ in range(1000):
-    law(*pointers)
+    call(*pointers)
 print(f"{1e3 * (time.perf_counter() - start):.0f} µs a call")

@@ -11,7 +11,7 @@ import torch
 from scipy.linalg import solve_discrete_are
 
 import pinn_dyn
-from pinn_dyn.control import Controller, SetPoint, SystemPlant, close_loop
+from pinn_dyn.control import SetPoint, Stage, SystemPlant, close_loop
 from pinn_dyn.data import DynamicsData, InitialStates, MultiSine, SimulatedSource
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import FixedInput, LagrangianNetwork
@@ -40,7 +40,7 @@ class CartPole(pinn_dyn.MechanicalSystem):
         return torch.tensor([[1.0], [0.0]]).to(q).expand(*q.shape, 1)
 
 
-class LinearQuadraticRegulator(Controller):
+class LinearQuadraticRegulator(Stage):
     """u = -K x, with K for the cost sum x^T Q x + u^T R u of the sampled linear model."""
 
     def __init__(self, A, B, Q, R):
@@ -48,8 +48,8 @@ class LinearQuadraticRegulator(Controller):
         P = solve_discrete_are(A, B, Q, R)
         self.K = torch.from_numpy(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
 
-    def __call__(self, t, q, v, reference):
-        return -torch.cat([q - reference.q, v - reference.v], -1) @ self.K.mT
+    def step(self, q, v, reference, applied, memory):
+        return -torch.cat([q - reference.q, v - reference.v], -1) @ self.K.mT, memory
 
 
 robot = CartPole(num_coordinates=2, num_inputs=1)

@@ -83,7 +83,7 @@ law = PredictiveControl(
 rng = np.random.default_rng(0)
 q0, v0 = (torch.from_numpy(rng.uniform(-1, 1, (args.starts, 2))) for _ in range(2))
 record = close_loop(
-    SystemPlant(robot), law, upright, q0, v0, duration=args.duration, rate=1 / law.step
+    SystemPlant(robot), law, upright, q0, v0, duration=args.duration, rate=1 / law.step_size
 )
 error = (record.q - record.reference.q)[:, record.t >= args.duration - 0.5].abs().amax((1, 2))
 failed = record.diagnostics["solver_failed"].nansum()

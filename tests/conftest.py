@@ -20,7 +20,7 @@ LONG = (
     *("test_configurations", "test_code_blocks", "test_sweep_jobs", "test_known_runs"),
     *("test_known_systems", "test_played_pages", "test_examples", "test_least_squares"),
     *("test_log_training", "test_evaluation", "test_control", "test_planted_faults"),
-    *("test_c_loop", "test_safe_law", "test_api", "test_report", "test_log_check"),
+    *("test_c_loop", "test_pipeline", "test_api", "test_report", "test_log_check"),
     # Of make test-slow.
     *("test_notebooks", "test_slurm", "test_wheel", "test_workers", "test_integrators"),
     *("test_random_chains", "test_export", "test_known_laws", "test_gradients", "test_learner"),

@@ -16,22 +16,11 @@ from torch import Tensor
 
 from pinn_dyn.app.config import checked
 from pinn_dyn.app.control_results import write_results
-from pinn_dyn.control import (
-    Controller,
-    DataRegion,
-    DisturbanceObserver,
-    Guarded,
-    LatentLaw,
-    LatentPlan,
-    MotorPID,
-    Reference,
-    export_law,
-    term_conditions,
-)
-from pinn_dyn.control.dead_time import compensated
+from pinn_dyn.control import DataRegion, Guarded, Pipeline, Reference, Stage, export_law
 from pinn_dyn.data import DataSource, SimulationError
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
+from pinn_dyn.evaluation.learned_terms import term_conditions
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
 from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.run.build import ConfigError, build_part
@@ -94,14 +83,14 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         progress=True,
         **{
             key: config[key]
-            for key in ("duration", "rate", "samples_rate", "delay", "settled_after")
+            for key in ("duration", "rate", "samples_rate", "dead_time", "settled_after")
         },
     )
     for name, record in result.records.items():
         for index, reason in enumerate(record.stopped):
             if reason:
                 log.warning("%s, run %d was stopped: %s", name, index, reason)
-    error = write_results(result, source, learned, robot, reference, config, folder, origin)
+    error = write_results(result, source, robot, reference, config, folder, origin)
     first, record = next(iter(result.records.items()))
     if reasons := [reason for reason in record.stopped if reason]:
         raise SimulationError(
@@ -113,14 +102,11 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
 
 def _require_learned_law(config: dict[str, Any], source: DataSource) -> None:
     """Refuse keys that would be ignored without the learned law, or without a robot."""
-    used = {"stability": config["stability"], "guard": config["guard"].get("threshold")}
-    keys = [key for key, value in used.items() if value is not None]
-    of_loop = [key for key in keys if key != "guard" or not config["export"]]
-    if source.system is None and of_loop:
-        names = " and ".join(of_loop)
-        raise ConfigError(f"{names}: {source.name} has no simulated robot: leave the key out")
-    if "learned" not in config["controllers"] and keys:
-        raise ConfigError(f"{' and '.join(keys)}: needs the controller 'learned': do not remove it")
+    is_guarded = config["guard"].get("threshold") is not None
+    if source.system is None and is_guarded and not config["export"]:
+        raise ConfigError(f"guard: {source.name} has no simulated robot: leave the key out")
+    if "learned" not in config["controllers"] and is_guarded:
+        raise ConfigError("guard: needs the controller 'learned': do not remove it")
     law = config["exported_law"]
     if config["export"] and config["controllers"].get(law, {}).get("terms") != "learned":
         parts = config["controllers"].items()
@@ -161,33 +147,21 @@ def _law(
     config: dict[str, Any],
     learned: MechanicalSystem | CoupledOscillators,
     truth: MechanicalSystem | CoupledOscillators,
-) -> Controller:
-    """Build a law with its observer, guard and compensation of the delay, for loop and export."""
+) -> Pipeline:
+    """Build a law with its observer, guard, limits and dead time, for loop and export."""
     law = build_law(config, name, learned, truth)
-    latent = law.law if isinstance(law, LatentPlan) else law
-    if isinstance(latent, LatentLaw):
-        if config["guard"].get("threshold") is not None:
-            raise ConfigError("guard: a law on oscillators has no guard: leave the key out")
-        latent.dead_time = float(np.max(run.input_delay, initial=0.0))
-        return law
-    if isinstance(law, MotorPID):
-        return law
     guarded = {"learned", config["exported_law"]} if config["export"] else {"learned"}
     if config["guard"].get("threshold") is not None and name in guarded:
         law = _guarded(law, config, run.source)
-    model = learned if config["controllers"][name]["terms"] == "learned" else truth
-    assert isinstance(model, MechanicalSystem)
     actuator = build_part("actuator", config["actuator"])
-    return compensated(law, model, run.input_delay, config["rate"], actuator)
+    return Pipeline(law, 1 / config["rate"], actuator=actuator, dead_time=run.input_delay)
 
 
-def _export(law: Controller, run: Run, config: dict[str, Any]) -> None:
+def _export(law: Pipeline, run: Run, config: dict[str, Any]) -> None:
     try:
         path = export_law(
             law,
             config["export"],
-            actuator=build_part("actuator", config["actuator"]),
-            period=config["rate"] and 1 / config["rate"],
             real=config["export_real"],
             about={"q": run.labels, "u": run.input_labels},
             ranges=ranges_of(run.statistics),
@@ -208,8 +182,6 @@ def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem | Coup
     elif config["member"]:
         raise ConfigError(f"member is {config['member']}, but {run.folder} holds a single model")
     if isinstance(model, CoupledOscillators):
-        if config["stability"] is not None:
-            raise ConfigError("stability: oscillators have no terms M, G and A: leave the key out")
         return double_copy(model).requires_grad_(False)
     if not isinstance(model, MechanicalSystem):
         raise ConfigError(
@@ -231,11 +203,10 @@ def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | Non
     return torch.from_numpy(q0), torch.from_numpy(v0)
 
 
-def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Controller:
+def _guarded(law: Stage, config: dict[str, Any], source: DataSource) -> Stage:
     train = source.load().train
     q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))
-    model = (law.law if isinstance(law, DisturbanceObserver) else law).model  # type: ignore[attr-defined]
-    region = DataRegion(q, v, angles=getattr(model, "angles", source.angles))
+    region = DataRegion(q, v, angles=getattr(law.model, "angles", source.angles))
     return Guarded(law, region, **config["guard"])
 
 
@@ -245,9 +216,7 @@ def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Referenc
     return build_part("reference", part, *([robot] if part.get("_partial_") else []))
 
 
-def build_law(
-    config: dict[str, Any], name: str, learned: Predictor, truth: Predictor
-) -> Controller:
+def build_law(config: dict[str, Any], name: str, learned: Predictor, truth: Predictor) -> Stage:
     """Build one of ``config["controllers"]`` on the terms that it names, with its observer."""
     part = config["controllers"][name]
     model = learned if part["terms"] == "learned" else truth

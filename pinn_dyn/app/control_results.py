@@ -7,17 +7,8 @@ from typing import Any
 
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
-from pinn_dyn.control import (
-    ClosedLoopRecord,
-    Helix,
-    Reference,
-    certify,
-    predict_steady_state,
-    required_gain,
-    stability_report,
-)
+from pinn_dyn.control import ClosedLoopRecord, Helix, Reference
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
     ControlResult,
@@ -25,25 +16,20 @@ from pinn_dyn.evaluation import (
     closed_loop_figure,
     controller_comparison_figure,
     save,
-    steady_state_figure,
     tip_path_figure,
 )
 from pinn_dyn.evaluation.control_figures import ERROR, control_errors
 from pinn_dyn.evaluation.report.control_page import control_report, shown_columns
 from pinn_dyn.evaluation.report.page import Origin
-from pinn_dyn.evaluation.tables import to_text, with_unit, write_table
+from pinn_dyn.evaluation.tables import to_text, with_unit
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.systems import Drawable, HasTip
 from pinn_dyn.whole import write_whole
-
-_ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
 
 
 def write_results(
     result: ControlResult,
     source: DataSource,
-    learned: MechanicalSystem | CoupledOscillators,
     robot: MechanicalSystem,
     reference: Reference,
     config: dict[str, Any],
@@ -54,14 +40,7 @@ def write_results(
     records, summary = result.records, result.table
     first = next(iter(records))
     result.save(folder)
-    figures, stability = _figures(records, source, robot, reference, config), None
-    if config["stability"] is not None:
-        assert isinstance(learned, MechanicalSystem)
-        stability, bounds = _stability(learned, robot, records["learned"], config, folder)
-        title = "Steady-state error of the learned regulator and its predicted bound"
-        if bounds[0].isfinite().any():
-            label = with_unit(ERROR, source.labels)
-            figures["steady_state"] = steady_state_figure(*bounds, title=title, label=label)
+    figures = _figures(records, source, robot, reference, config)
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
     animation: Path | None = None
@@ -78,44 +57,11 @@ def write_results(
         figures=figures,
         labels=source.labels,
         animation=animation,
-        stability=stability,
         origin=origin,
     )
     write_whole(folder / "report.html", report)
     print(f"\ntables, figures and records are in {folder}; open report.html in a browser")
     return result.metrics[first].summary["rms_error"]
-
-
-def _stability(
-    learned: MechanicalSystem,
-    robot: MechanicalSystem,
-    record: ClosedLoopRecord,
-    config: dict[str, Any],
-    folder: Path,
-) -> tuple[str, tuple[Tensor, Tensor]]:
-    """Write Proposition 1 over a box; return the report, bounds and measured errors."""
-    box = config["stability"]
-    low, high = (torch.tensor(box[key], dtype=torch.float64) for key in ("q_low", "q_high"))
-    generator = torch.Generator().manual_seed(config["seed"])
-    shape = (box["samples"], len(low))
-    q = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
-    gains = config["gains"]["position"], config["gains"]["velocity"]
-    conditions = certify(learned, robot, q, *gains)
-    write_table(conditions, folder, "stability_region")
-
-    q_ref = record.reference.q[:, 0]
-    if (record.reference.q != q_ref[:, None]).any():
-        raise ValueError("stability needs set points, and the reference moves")
-    predicted = predict_steady_state(learned, robot, q_ref, *gains)
-    measured = torch.linalg.vector_norm(record.q[:, -1] - q_ref, dim=-1)
-    table = predicted.assign(measured_error=measured.numpy())
-    write_table(table, folder, "stability_set_points")
-    required = {error: required_gain(learned, robot, q_ref, error=error) for error in _ERRORS}
-    title = f"Stability of the regulator over {box['region']}, K_P = {gains[0]}, K_D = {gains[1]}"
-    text = stability_report(title, conditions, predicted, measured, required)
-    write_whole(folder / "stability.md", text)
-    bound = torch.tensor(table["bound"].where(table["holds"], torch.inf).to_numpy())
-    return text, (bound, measured)
 
 
 def _figures(
@@ -137,7 +83,6 @@ def _figures(
             title=f"{source.name}, run {k}" + ("" if k == run else " (the worst of a law)"),
             labels=source.labels,
             input_labels=source.input_labels,
-            held=config["rate"] is not None,
         )
     if isinstance(reference, Helix) and isinstance(robot, HasTip):
         t = next(iter(records.values())).t

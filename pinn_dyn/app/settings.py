@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torch.optim import Optimizer
     from torch.optim.lr_scheduler import LRScheduler
 
-    from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
+    from pinn_dyn.control import Actuator, Plant, Reference, Sensor, Stage
     from pinn_dyn.data import DataSource, DynamicsData, InitialStates
     from pinn_dyn.evaluation import RolloutValidator
     from pinn_dyn.identification.motion_limits import JointValues, MotionLimits
@@ -114,8 +114,8 @@ class Law:
     """A control law on the terms of the learned model or of the true system."""
 
     terms: Literal["learned", "truth"]
-    law: Controller | Callable[..., Controller]
-    observer: Controller | Callable[..., Controller] | None = None
+    law: Stage | Callable[..., Stage]
+    observer: Stage | Callable[..., Stage] | None = None
 
 
 @dataclass(kw_only=True)
@@ -127,16 +127,6 @@ class Guard:
 
 
 @dataclass(kw_only=True)
-class Stability:
-    """Box of configurations in which the conditions of Proposition 1 are evaluated."""
-
-    region: str
-    q_low: Sequence[float]
-    q_high: Sequence[float]
-    samples: PositiveInt
-
-
-@dataclass(kw_only=True)
 class ControlSettings(_RunSettings):
     """Keys of control.py."""
 
@@ -144,17 +134,16 @@ class ControlSettings(_RunSettings):
     member: NonNegativeInt
     gains: Gains | Mapping[str, Any]
     duration: PositiveFloat
-    rate: PositiveFloat | None
-    samples_rate: PositiveFloat
+    rate: PositiveFloat
+    samples_rate: PositiveFloat | None
     initial_states: InitialStates | None
     runs: PositiveInt
     seed: Seed
     robot: Mapping[str, Any]
     actuator: Actuator
     sensor: Sensor
-    delay: NonNegativeFloat
+    dead_time: NonNegativeFloat
     guard: Guard | Mapping[str, Any]
-    stability: Stability | Mapping[str, Any] | None
     export: str | None
     exported_law: str
     export_real: Literal["double", "float"]

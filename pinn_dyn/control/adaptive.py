@@ -10,7 +10,7 @@ import torch
 from pydantic import Field, PositiveFloat
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Motion
+from pinn_dyn.control.contracts import Motion, Step
 from pinn_dyn.control.laws import Gain, ModelBasedLaw
 from pinn_dyn.mechanics import InputSolver, MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec, spd_solve
@@ -48,8 +48,14 @@ class AdaptiveTracking(ModelBasedLaw):
     Held for a period T: J <- B (1 - X/2)^-1 (1 + X/2) B^T with J = B B^T and X = g T B^T S B, which
     is limited to a norm of 1/2 and keeps J positive.
 
+    At limits of the input, a torque A (u - u_applied) is missing. Then s - sigma replaces s in the
+    laws of adaptation, with the part sigma of s that the missing torque explains (without C)::
+
+        M dsigma/dt + K_D sigma = A (u - u_applied)
+
     Sources: Slotine and Li 1987, "On the adaptive control of robot manipulators"; Lee, Kwon and
-    Park 2018, "A natural adaptive control law for robot manipulators".
+    Park 2018, "A natural adaptive control law for robot manipulators"; Karason and Annaswamy 1994,
+    "Adaptive control in the presence of input constraints".
 
     Args:
         model: a :class:`RigidChain`, or known mechanics on one, in float64.
@@ -61,12 +67,14 @@ class AdaptiveTracking(ModelBasedLaw):
         max_condition, solver: as for :class:`ModelBasedLaw`.
 
     Attributes:
-        memory: logarithmic changes of J (10 parameters) and f, and o / b, of the latest call,
-            ``(*batch, P)``; None before.
+        constants_size: P, the length of the constants: logarithmic changes of J (10 parameters) and
+            f, and o / b.
 
     Raises:
         TypeError: on a model without a rigid chain.
     """
+
+    needs_period = True
 
     def __init__(
         self,
@@ -98,40 +106,49 @@ class AdaptiveTracking(ModelBasedLaw):
         n = chain.num_coordinates
         sizes = {"payload": 10, "friction": n, "offset": n}
         self.sizes = [sizes[part] if part in self.adapt else 0 for part in sizes]
-        self.memory_size = sum(self.sizes)
+        self.constants_size = sum(self.sizes)
+        self.memory_size = self.constants_size + model.num_coordinates + model.num_inputs
         super().__init__(
             model, position_gain, velocity_gain, max_condition=max_condition, solver=solver
         )
 
-    def reset(self) -> None:
-        super().reset()
-        self.memory: Tensor | None = None
-        self._time, self._changes = 0.0, torch.zeros(())
+    def step(
+        self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
+    ) -> Step:
+        """Return u ``(*batch, M)``; the memory holds the constants, sigma and u."""
+        sizes = [self.constants_size, self.num_coordinates, self.num_inputs]
+        constants, lag, wanted = memory.split(sizes, dim=-1)
+        tau = self._torque(q, v, reference, constants)
+        u, _, report = self._input(q, v, tau, None, applied, constants)
+        missing = self.model._applied_force(q, v, wanted) - self.model._applied_force(q, v, applied)
+        mass = self.model.mass_matrix(q) / self.period
+        gain = torch.diag_embed(self.velocity_gain.to(q).expand(q.shape))
+        lag = spd_solve(mass + gain, matvec(mass, lag) + missing)
+        changes = self.changes(q, v, reference, constants, lag)
+        adapted = self.adapted(constants, changes, self.period)
+        if self.sizes[0]:
+            report = {**report, "adapted_mass": self._inertia(constants)[..., 3, 3]}
+        return Step(u, torch.cat([adapted, lag, u], dim=-1), report)
 
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        with torch.no_grad():
-            if self.memory is None or self.memory.shape[:-1] != q.shape[:-1]:
-                self.memory = q.new_zeros(*q.shape[:-1], self.memory_size)
-            elif t > self._time:
-                self.memory = self.adapted(self.memory, self._changes, t - self._time)
-            u = super().__call__(t, q, v, reference)
-            self._time, self._changes = t, self.changes(q, v, reference, self.memory)
-        return u
+    def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return the constants of the model, and no torque that is missing."""
+        zero = q.new_zeros(*q.shape[:-1], self.constants_size + self.num_coordinates)
+        return torch.cat([zero, u], dim=-1)
 
-    def law_of(self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor) -> Tensor:
-        """Return u ``(*batch, M)`` with the constants of a memory, without side effects."""
-        self.memory = memory
-        return self._input(q, v, reference, None, all_steps=True)[0]
+    def stiffness(self) -> None:
+        """Return None: the position gain is in 1/s."""
 
-    def changes(self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor) -> Tensor:
+    def changes(
+        self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor, lag: Tensor
+    ) -> Tensor:
         """Return the rates of change B^T S B, of log f and of o / b, ``(*batch, R)``."""
         w, rate = self._wanted(q, v, reference)
-        error = w - v
+        error = w - v - lag
         parts = []
         if self.sizes[0]:
             weights = (error.unsqueeze(-1) * self._regressor(q, v, w, rate)).sum(-2)
             S = (weights @ self._parts.flatten(1)).unflatten(-1, (4, 4))
-            B = torch.linalg.cholesky(self._inertia(memory))
+            B = self._root(memory)
             parts.append((B.mT @ (0.5 * (S + S.mT)) @ B).flatten(-2))
         _, factor, _ = self._constants(memory)
         if self.sizes[1]:
@@ -149,7 +166,7 @@ class AdaptiveTracking(ModelBasedLaw):
             X = period * moved.unflatten(-1, (4, 4))
             X = X / (1 + X.square().sum((-2, -1), keepdim=True).sqrt() / _STEP)
             unit = torch.eye(4).to(X)
-            B = torch.linalg.cholesky(self._inertia(memory))
+            B = self._root(memory)
             inertia = B @ spd_solve((unit - X / 2).unsqueeze(-3), (unit + X / 2).mT) @ B.mT
             body = self._bodies.parameters_of(inertia.unsqueeze(-3)).squeeze(-2)
         steps = [(period * x).clamp(-_STEP, _STEP) for x in others]
@@ -157,9 +174,11 @@ class AdaptiveTracking(ModelBasedLaw):
         return torch.cat([body, friction, (offset + steps[1]).clamp(-1, 1)], dim=-1)
 
     def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, None]:
-        assert self.memory is not None
+        return self._torque(q, v, reference, q.new_zeros(self.constants_size)), None
+
+    def _torque(self, q: Tensor, v: Tensor, reference: Motion, constants: Tensor) -> Tensor:
         w, rate = self._wanted(q, v, reference)
-        change, factor, offset = self._constants(self.memory)
+        change, factor, offset = self._constants(constants)
         zero = torch.zeros_like(v)
         model = self.model
         # C(q, v) w by the polarization of C(q, v) v, whose symbols are symmetric in v and w.
@@ -168,7 +187,7 @@ class AdaptiveTracking(ModelBasedLaw):
         tau = tau + factor * model.dissipative_force(q, w) - offset
         if self.sizes[0]:
             tau = tau + matvec(self._regressor(q, v, w, rate), change)
-        return tau + self.velocity_gain.to(q) * (w - v), None
+        return tau + self.velocity_gain.to(q) * (w - v)
 
     def _wanted(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
         """Return w and dw/dt."""
@@ -185,6 +204,11 @@ class AdaptiveTracking(ModelBasedLaw):
         both, apart = (self.chain.regressor(q, x, zero) for x in (v + w, v - w))
         return (at_rest + (both - apart) / 4)[..., self._columns]
 
+    def _root(self, memory: Tensor) -> Tensor:
+        """Return B with J = B B^T, NaN where rounding has made J indefinite."""
+        factor, failed = torch.linalg.cholesky_ex(self._inertia(memory))
+        return torch.where(failed[..., None, None] == 0, factor, torch.nan)
+
     def _inertia(self, memory: Tensor) -> Tensor:
         """Return J, ``(*batch, 4, 4)``."""
         z = memory[..., : self.sizes[0]] if self.sizes[0] else memory.new_zeros(10)
@@ -197,10 +221,3 @@ class AdaptiveTracking(ModelBasedLaw):
         change = inertial_parameters(self._inertia(memory) - self._bodies.start()[0])
         factor = friction.exp() if self.sizes[1] else one
         return change, factor, self.offset * offset if self.sizes[2] else 0 * one
-
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return those of the law, and ``adapted_mass``, the mass of the adapted body, kg."""
-        if self.memory is None:
-            return {}
-        mass = {"adapted_mass": self._inertia(self.memory)[..., 3, 3]} if self.sizes[0] else {}
-        return super().diagnostics() | mass

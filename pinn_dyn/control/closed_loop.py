@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections import defaultdict, deque
+from collections import deque
 
 import torch
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
+from pinn_dyn.control.contracts import Motion, Plant, Reference, Stage
 from pinn_dyn.control.effects import Actuator, Sensor
+from pinn_dyn.control.pipeline import STATUS, Pipeline
 from pinn_dyn.control.record import ClosedLoopRecord
-from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.progress import Progress
+
+log = logging.getLogger(__name__)
+
+STOPS = {
+    "not_finite": "the law's input is not finite",
+    "singular": "the input matrix A(q) is nearly singular: its condition number exceeds "
+    "max_condition",
+    "unreachable": "no input gives the force of the law, so the last input is held",
+    "no_plan": "the solver found no plan for longer than the horizon",
+}
+"""Reasons to stop a copy, by the marks of the status."""
+Q_BOUND = 1e3
+"""Largest |q| of a copy that has not diverged, in the units of q."""
 
 
 def close_loop(
     plant: Plant,
-    controller: Controller,
+    controller: Stage | Pipeline,
     reference: Reference,
     q0: Tensor,
     v0: Tensor,
@@ -27,41 +42,52 @@ def close_loop(
     rate: float,
     actuator: Actuator | None = None,
     sensor: Sensor | None = None,
-    delay: float = 0.0,
+    dead_time: NonNegativeFloat = 0.0,
+    samples_rate: PositiveFloat | None = None,
     progress: str | None = None,
 ) -> ClosedLoopRecord:
     """Run a sampled closed loop, K copies at once, with the input held between instants::
 
-        u_wanted(t_k) = law(t_k, q + noise, v + noise, reference(t_k))
-        u(t_k) = actuator(u_wanted(t_k-d)),    t_k = k / rate,  k = 0 ... duration * rate
+        u(t_k), memory = pipeline(q + noise, v + noise, reference(t_k), memory),    t_k = k / rate
 
     A copy is stopped if its state, measurement or input is not finite, |q| exceeds 1000, or the
-    controller reports a fault. The other copies go on. Ctrl-C returns the record up to then.
+    status of the pipeline is a reason of :data:`STOPS`. The other copies go on. Ctrl-C returns the
+    record up to then.
 
     Args:
         plant: the plant that is controlled.
-        controller: the law; it is reset first.
+        controller: the law, or its :class:`Pipeline`.
         reference: the desired motion.
         q0, v0: initial configurations and velocities, ``(K, N)`` each.
         duration: length of the run in s, an integer multiple of 1 / rate.
         rate: control instants per second, 1/s.
-        actuator: limits of the input.
+        actuator: limits of the input of a law.
         sensor: noise of the measurement.
-        delay: dead time of the input in control instants, also 1.5, with zero input before.
+        dead_time: time after which the plant's inputs act, s, with the first input before.
+        samples_rate: samples of the record per second, 1/s, of which the rate is a multiple; None
+            for all instants.
         progress: name of the task in lines of progress; None logs none.
 
     Raises:
-        ValueError: on sizes that do not agree, or a duration that is no multiple of 1 / rate.
+        ValueError: on sizes that do not agree, a duration that is no multiple of 1 / rate, or a
+            pipeline of another period.
     """
     q0, v0 = q0.double(), v0.double()
-    run = LoopRun(plant, controller, reference, q0, v0, duration, rate, actuator)
-    waiting = math.ceil(delay)
-    share = delay - waiting + 1  # of an interval, before the next input in the queue acts
-    queue = deque([q0.new_zeros(len(q0), plant.num_inputs)] * waiting)
+    if isinstance(controller, Stage):
+        controller = Pipeline(controller, 1 / rate, actuator=actuator)
+    elif actuator is not None:
+        raise ValueError("actuator: a pipeline has its own limits, give them to the pipeline")
+    _check(plant, controller, reference, q0, v0, rate)
+    every = 1 if samples_rate is None else max(1, round(rate / samples_rate))
+    run = _Run(controller, reference, q0, _instants(duration, rate), every)
+    waiting = math.ceil(dead_time * rate - 1e-9)
+    share = dead_time * rate - waiting + 1  # of an interval, before the next input acts
+    queue = deque([controller.first_input.expand(len(q0), -1)] * waiting)
     if sensor is not None:
         sensor.reset()
     q, v, moving = q0.clone(), v0.clone(), run.running.clone()
-    k, pieces = 0, list[tuple[Tensor, float]]()
+    measured, k = (q.clone(), v.clone()), 0
+    pieces: list[tuple[Tensor, float]] = []
     try:
         with (
             torch.no_grad(),
@@ -77,138 +103,130 @@ def close_loop(
                 for acting, part in pieces:
                     q[moving], v[moving] = plant.advance(acting[moving], part / rate)
                 run.observe(k, q, v)
-                run.measure(k, *((q, v) if sensor is None else sensor(q, v)))
-                queue.append(run.ask(k))
-                u = run.apply(k, queue.popleft())
+                measured = run.measure(k, measured, (q, v) if sensor is None else sensor(q, v))
+                queue.append(run.ask(k, *measured))
+                u = queue.popleft()
+                run.write("u", k, u)
                 pieces = [(u, share)]
-                if share < 1:
-                    following = (actuator or Actuator()).limit(queue[0], u, 1 / rate)
-                    pieces.append((following, 1 - share))
+                if share < 1 - 1e-9:
+                    pieces.append((queue[0], 1 - share))
                 if not run.running.any():
                     break
     except KeyboardInterrupt:
-        run.stop(run.running, float(run.t[k]), "interrupted")
+        run.stop(run.running, k, "interrupted")
         return run.record(k + 1)
     return run.record(len(run.t))
 
 
-class LoopRun:
-    """The state of a run: the copies that still run, the law's measurements, and the record.
+class _Run:
+    """The state of a run: the copies that still run, the memory of the law, and the record."""
 
-    A copy with |q| beyond ``q_bound`` has diverged, in the units of q.
-    """
-
-    q_bound = 1e3
-
-    def __init__(
-        self,
-        plant: Plant | MechanicalSystem,
-        controller: Controller,
-        reference: Reference,
-        q0: Tensor,
-        v0: Tensor,
-        duration: float,
-        rate: float,
-        actuator: Actuator | None,
-    ):
-        n, m = plant.num_coordinates, plant.num_inputs
-        for name, sizes, expected in (
-            ("reference", (reference.num_coordinates,), (n,)),
-            ("controller", (controller.num_coordinates, controller.num_inputs), (n, m)),
-            ("q0", tuple(q0.shape), (len(q0), n)),
-            ("v0", tuple(v0.shape), (len(q0), n)),
-        ):
-            if sizes != expected:
-                raise ValueError(f"{name} has sizes {sizes}, expected {expected} of the plant")
-        require_finite("q0", q0)
-        require_finite("v0", v0)
-        steps = round(duration * rate)
-        if steps < 1 or abs(duration * rate - steps) > 1e-6:
-            raise ValueError(f"duration is {duration} s, expected a multiple of {1 / rate:g} s")
-        self.t = torch.arange(steps + 1, dtype=torch.float64) / rate
-        self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
-        self._shape_of_u = (len(q0), m)
-        self._controller, self._actuator = controller, actuator
-        self._interval = 1 / rate
-        self._measured = q0.clone(), v0.clone()
-        self._motions = [motion_of_copies(reference, float(t), q0) for t in self.t]
-        samples = (len(q0), len(self.t))
-        self._q, self._v = (q0.new_full((*samples, n), torch.nan) for _ in range(2))
-        self._u, self._u_wanted = (q0.new_full((*samples, m), torch.nan) for _ in range(2))
-        self._diagnostics: dict[str, Tensor] = defaultdict(lambda: self._q[..., 0] * torch.nan)
+    def __init__(self, pipeline: Pipeline, reference: Reference, q0: Tensor, t: Tensor, every: int):
+        self._every = every
+        self.t, self.running = t, torch.ones(len(q0), dtype=torch.bool, device=q0.device)
+        self._pipeline, self._reference, self._like = pipeline, reference, q0
+        self._memory = q0.new_zeros(len(q0), pipeline.memory_size)
+        self._columns: dict[str, Tensor] = {}
         self._stopped: list[str | None] = [None] * len(q0)
-        controller.reset()
-        controller.follow(reference)
-        if actuator is not None:
-            actuator.reset()
+        self._is_warned = False
 
-    def stop(self, mask: Tensor, time: float, reason: str) -> None:
+    def stop(self, mask: Tensor, k: int, reason: str) -> None:
         """Stop the copies of a mask ``(K,)`` that still run."""
-        if not mask.any():
-            return
-        for copy in (mask & self.running).nonzero()[:, 0].tolist():
-            self._stopped[copy] = f"{reason} at t = {time:.6g} s"
-        self.running &= ~mask
+        if mask.any():
+            for copy in (mask & self.running).nonzero()[:, 0].tolist():
+                self._stopped[copy] = f"{reason} at t = {float(self.t[k]):.6g} s"
+            self.running &= ~mask
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
         """Record the true state at instant k; stop the copies that have diverged."""
-        time = float(self.t[k])
         finite = finite_rows(q) & finite_rows(v)
-        self.stop(~finite, time, "the plant diverged: its state is not finite")
-        self._write(self._q[:, k], q)
-        self._write(self._v[:, k], v)
-        beyond = (q.abs() > self.q_bound).any(-1)
-        self.stop(beyond, time, f"the plant diverged: |q| is beyond {self.q_bound:g}")
+        self.stop(~finite, k, "the plant diverged: its state is not finite")
+        self.write("q", k, q)
+        self.write("v", k, v)
+        beyond = (q.abs() > Q_BOUND).any(-1)
+        self.stop(beyond, k, f"the plant diverged: |q| is beyond {Q_BOUND:g}")
 
-    def measure(self, k: int, q: Tensor, v: Tensor) -> None:
-        """Store the measurement at instant k; stop the copies where it is not finite."""
-        finite = finite_rows(q) & finite_rows(v)
-        self.stop(~finite, float(self.t[k]), "the measurement is not finite")
-        for stored, value in zip(self._measured, (q, v), strict=True):
-            self._write(stored, value)
+    def measure(
+        self, k: int, before: tuple[Tensor, Tensor], now: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the measurement, that before for stopped copies; stop copies where it is lost."""
+        finite = finite_rows(now[0]) & finite_rows(now[1])
+        self.stop(~finite, k, "the measurement is not finite")
+        running = self.running.unsqueeze(-1)
+        q, v = (torch.where(running, x, y) for x, y in zip(now, before, strict=True))
+        return q, v
 
-    def ask(self, k: int) -> Tensor:
-        """Return the law's input at instant k; meaningless for a stopped copy."""
+    def ask(self, k: int, q: Tensor, v: Tensor) -> Tensor:
+        """Return the input at instant k; meaningless for a stopped copy."""
         time = float(self.t[k])
-        u = self._controller(time, *self._measured, self._motions[k])
-        if u.shape != self._shape_of_u:
-            raise ValueError(
-                f"the controller's input has shape {tuple(u.shape)}, expected {self._shape_of_u}"
+        motions = [motion_of_copies(self._reference, time + x, q) for x in self._pipeline.ahead]
+        motion = motions[0]
+        if len(motions) > 1:
+            motion = Motion(*(torch.stack(x, dim=-2) for x in zip(*motions, strict=True)))
+        u, status, self._memory, report = self._pipeline.run(q, v, motion, self._memory)
+        for name, value in report.items():
+            self.write(name, k, value)
+        for name, reason in STOPS.items():
+            self.stop((status.long() & STATUS[name]) > 0, k, reason)
+        outside = (status.long() & STATUS["outside"]) > 0
+        if outside.any() and not self._is_warned:
+            self._is_warned = True
+            log.warning(
+                f"t = {time:.4g} s: {int(outside.sum())} of {len(outside)} states are outside the "
+                f"training data, at distances up to {float(report['distance'].max()):.3g} (1: edge "
+                "of the data)"
             )
-        self._write(self._u_wanted[:, k], u)
-        self._diagnose(k, self._controller.diagnostics())
-        for reason, mask in self._controller.faults().items():
-            self.stop(mask, time, reason)
-        self.stop(~finite_rows(u), time, "the law's input is not finite")
         return u
 
-    def apply(self, k: int, u: Tensor) -> Tensor:
-        """Return the input that passes the actuator at instant k."""
-        if self._actuator is not None:
-            u, changed = self._actuator(u, self._interval)
-            self._diagnose(k, {"saturated_inputs": changed.sum(-1)})
-        self._write(self._u[:, k], u)
-        return u
+    def write(self, name: str, k: int, value: Tensor) -> None:
+        """Record a value ``(K, ...)`` of the copies that run, at each of the recorded instants."""
+        if k % self._every:
+            return
+        shape = len(self.t[:: self._every]), *value.shape[1:]
+        if name not in self._columns:
+            self._columns[name] = self._like.new_full((len(value), *shape), torch.nan)
+        column = self._columns[name][:, k // self._every]
+        if self.running.all():
+            column.copy_(value)
+        else:
+            column[self.running] = value[self.running].to(column)
 
     def record(self, samples: int) -> ClosedLoopRecord:
         """Return the record of the first instants."""
-        motions = zip(*self._motions[:samples], strict=True)
-        reference = Motion(*(torch.stack(values, 1) for values in motions))
-        q, v, u, u_wanted = (x[:, :samples] for x in (self._q, self._v, self._u, self._u_wanted))
-        diagnostics = {name: values[:, :samples] for name, values in self._diagnostics.items()}
-        t = self.t[:samples]
-        return ClosedLoopRecord(t, q, v, u, u_wanted, reference, self._stopped, diagnostics)
+        t = self.t[: samples : self._every]
+        motions = [motion_of_copies(self._reference, float(x), self._like) for x in t]
+        reference = Motion(*(torch.stack(x, 1) for x in zip(*motions, strict=True)))
+        columns = {name: x[:, : len(t)] for name, x in self._columns.items()}
+        q, v, u, u_wanted = (columns.pop(name) for name in ("q", "v", "u", "u_wanted"))
+        return ClosedLoopRecord(t, q, v, u, u_wanted, reference, self._stopped, columns)
 
-    def _diagnose(self, k: int, values: dict[str, Tensor]) -> None:
-        for name, value in values.items():
-            self._write(self._diagnostics[name][:, k], value.to(self._q))
 
-    def _write(self, target: Tensor, values: Tensor) -> None:
-        """Copy the values of the running copies, ``(K, ...)``, into a part of the record."""
-        if not any(self._stopped):
-            target.copy_(values)
-        else:
-            target[self.running] = values[self.running]
+def _instants(duration: float, rate: float) -> Tensor:
+    steps = round(duration * rate)
+    if steps < 1 or abs(duration * rate - steps) > 1e-6:
+        raise ValueError(f"duration is {duration} s, expected a multiple of {1 / rate:g} s")
+    return torch.arange(steps + 1, dtype=torch.float64) / rate
+
+
+def _check(
+    plant: Plant, pipeline: Pipeline, reference: Reference, q0: Tensor, v0: Tensor, rate: float
+) -> None:
+    n, m = plant.num_coordinates, plant.num_inputs
+    for name, sizes, expected in (
+        ("reference", (reference.num_coordinates,), (n,)),
+        ("controller", (pipeline.num_coordinates, pipeline.num_inputs), (n, m)),
+        ("q0", tuple(q0.shape), (len(q0), n)),
+        ("v0", tuple(v0.shape), (len(q0), n)),
+    ):
+        if sizes != expected:
+            raise ValueError(f"{name} has sizes {sizes}, expected {expected} of the plant")
+    require_finite("q0", q0)
+    require_finite("v0", v0)
+    if abs(pipeline.period * rate - 1) > 1e-6:
+        raise ValueError(
+            f"the period of the pipeline is {pipeline.period:g} s, expected {1 / rate:g} s of the "
+            "loop"
+        )
 
 
 def finite_rows(x: Tensor) -> Tensor:

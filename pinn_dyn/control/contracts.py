@@ -1,11 +1,19 @@
-"""The three contracts of a control loop: reference, controller and plant."""
+"""The contracts of a control loop: reference, stage and plant."""
 
 from __future__ import annotations
 
 import abc
-from typing import NamedTuple
+import copy
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
+
+from pinn_dyn.control.effects import Actuator, Values
+
+_KINDS = "is_python", "is_long", "predicts"
+_ROUNDING = 1e-6  # relative; numbers of files may be of type float
 
 
 class Motion(NamedTuple):
@@ -26,30 +34,134 @@ class Reference(abc.ABC):
         """Return the desired motion at time t in s, ``(N,)`` each or ``(K, N)`` for K runs."""
 
 
-class Controller(abc.ABC):
-    """A control law u = u(t, q, v, reference) with N coordinates and M inputs, batched."""
+class Step(NamedTuple):
+    """Input ``(*batch, M)``, memory for the next call ``(*batch, memory_size)``, and its report.
+
+    The report holds numbers and marks by name, ``(*batch,)`` each. The marks of
+    :data:`~.pipeline.STATUS` are bits of the status, the other entries go into the record.
+    """
+
+    u: Tensor
+    memory: Tensor
+    report: Mapping[str, Tensor] = {}
+
+
+def is_applied(wanted: Tensor, applied: Tensor) -> Tensor:
+    """Return true where all inputs are those that a stage wanted, ``(*batch, 1)``, up to rounding.
+
+    A stage that integrates holds its memory elsewhere, so that it does not wind up at limits.
+    """
+    equal = (applied - wanted).abs() <= _ROUNDING * wanted.abs()
+    return equal.to(wanted).sum(-1, keepdim=True) > wanted.shape[-1] - 0.5
+
+
+class Setting(NamedTuple):
+    """Constants of a pipeline: period and longest dead time in s, limits, and the first input."""
+
+    period: float
+    dead_time: float
+    actuator: Actuator
+    first_input: Tensor
+
+
+class Stage(abc.ABC):
+    """A control law, or a stage around one: a pure function of the measurement and its memory.
+
+    :class:`~.pipeline.Pipeline` calls it once in a period, in a closed loop and in exported files.
+    The operations of :meth:`step` must not depend on numbers, unless ``is_python``.
+
+    Attributes:
+        num_coordinates, num_inputs: N and M.
+        memory_size: length of the memory.
+        period: time between two calls, s; NaN until :meth:`at`.
+        needs_period: true for a stage with a memory of time.
+        ahead: times from the measurement to the references that a call takes, s.
+        model: the model of the law, or None; its ``dead_time`` is that of its run.
+        first_input: input before the first call, one number or M.
+        is_python: true for a stage whose operations depend on numbers: it has no code in C.
+        is_long: true for a stage with so much code that closed loops do not compile it.
+        predicts: true for a law that compensates a dead time itself.
+    """
+
+    memory_size = 0
+    period = float("nan")
+    needs_period = False
+    ahead: tuple[float, ...] = (0.0,)
+    model: Any = None
+    first_input: Values = 0.0
+    is_python = False
+    is_long = False
+    predicts = False
 
     def __init__(self, num_coordinates: int, num_inputs: int):
         self.num_coordinates = num_coordinates
         self.num_inputs = num_inputs
 
-    def reset(self) -> None:  # noqa: B027 - most laws have no memory
-        """Forget the past, before a new run."""
+    def at(self, setting: Setting) -> Any:
+        """Return a copy of the stage with the constants of a pipeline."""
+        stage = copy.copy(self)
+        stage.period = setting.period
+        return stage
 
-    def follow(self, reference: Reference) -> None:  # noqa: B027 - most laws do not look ahead
-        """Store the reference of a new run, for laws that look ahead."""
+    def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor | None:
+        """Return the memory before the first call with the measurement q, v; None for zeros."""
+        return None
+
+    def stiffness(self) -> tuple[Tensor, Tensor] | None:
+        """Return K_P in N/m or Nm/rad and K_D, or None for a law without them."""
+        return None
+
+    def about(self) -> dict[str, Any]:
+        """Return fields for the information in a file."""
+        gains = {key: getattr(self, key, None) for key in ("position_gain", "velocity_gain")}
+        listed = {key: x.tolist() if isinstance(x, Tensor) else x for key, x in gains.items()}
+        return {"law": type(self).__name__, "observer": None, "guard": None, **listed}
 
     @abc.abstractmethod
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return u ``(*batch, M)`` at time t in s, from the measured q and v ``(*batch, N)``."""
+    def step(
+        self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
+    ) -> Step | tuple[Tensor, Tensor]:
+        """Return the input and the memory for the next call.
 
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return named numbers about the latest call for the record, ``(*batch,)`` each."""
-        return {}
+        Args:
+            q, v: measurement, ``(*batch, N)``.
+            reference: desired motion, ``(*batch, N)`` each; ``(*batch, S, N)`` with S times ahead.
+            applied: input since the previous call, after all limits, ``(*batch, M)``.
+            memory: memory of the previous call or of :meth:`start`.
+        """
 
-    def faults(self) -> dict[str, Tensor]:
-        """Return reasons to stop after the latest call, each with its mask ``(*batch,)``."""
-        return {}
+
+class Wrapper(Stage):
+    """A stage around a law, whose memory follows its own.
+
+    Args:
+        law: the law, also with other stages around it.
+        own_size: length of the memory of this stage.
+    """
+
+    def __init__(self, law: Stage, own_size: int = 0):
+        super().__init__(law.num_coordinates, law.num_inputs)
+        self.law, self.own_size = law, own_size
+        self._adopt(law)
+
+    def _adopt(self, law: Stage) -> None:
+        self.law, self.memory_size = law, self.own_size + law.memory_size
+        for name in ("ahead", "model", "first_input", *_KINDS):
+            setattr(self, name, getattr(law, name))
+        self.needs_period = law.needs_period or self.own_size > 0
+
+    def at(self, setting: Setting) -> Any:
+        stage = super().at(setting)
+        stage._adopt(self.law.at(setting))
+        return stage
+
+    def stiffness(self) -> tuple[Tensor, Tensor] | None:
+        return self.law.stiffness()
+
+    def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor | None:
+        memory = self.law.start(q, v, u)
+        own = q.new_zeros(*q.shape[:-1], self.own_size)
+        return memory if memory is None else torch.cat([own, memory], dim=-1)
 
 
 class Plant(abc.ABC):

@@ -1,34 +1,30 @@
-"""A law that compensates the dead time of its inputs by predicting the state."""
+"""Prediction of the state over the dead time of the inputs."""
 
 from __future__ import annotations
 
-import copy
 import math
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from pydantic import PositiveFloat
 from torch import Tensor
 
-from pinn_dyn.control.closed_loop import motion_of_copies
-from pinn_dyn.control.contracts import Controller, Motion, Reference
-from pinn_dyn.control.effects import Actuator
 from pinn_dyn.exports.model_functions import held_step
+from pinn_dyn.exports.repeated import repeated, sharing
 from pinn_dyn.mechanics import MechanicalSystem
 
+_ROUNDING = 1e-6  # of periods
 
-class DelayCompensation(Controller):
-    """A law whose inputs act after a dead time d, at the state that the model predicts::
+
+class DeadTime:
+    """Compensation of inputs that act after a dead time d, by the state that the model predicts::
 
         x(t_k + d) = x(t_k) + integral from t_k to t_k + d of f(x, u(s - d)) ds
-        u_k = law(t_k + d, x(t_k + d), reference(t_k + d))
+        u_k = law(x(t_k + d), reference(t_k + d))
 
-    The inputs since t_k - d are the memory of the law, zero before the first call. In the predicted
-    state, the plant has no dead time: gains, an observer, a guard and predictive control are those
-    for the plant without it. The reference is followed without lag if it is known ahead
-    (:meth:`follow`). A disturbance acts for d before the law can react, and shifts the predicted
-    state by d^2 / 2 of the acceleration that it causes.
+    In the predicted state, the plant has no dead time: gains, an observer, a guard and predictive
+    control are those for the plant without it. A disturbance acts for d before the law can react,
+    and shifts the predicted state by d^2 / 2 of the acceleration that it causes.
 
     If inputs have different dead times, d is the longest, and the other inputs are held back by the
     difference, interpolated between two periods.
@@ -37,113 +33,42 @@ class DelayCompensation(Controller):
     spectrum assignment problem for systems with delays.
 
     Args:
-        law: the law for the plant without dead time, also with an observer or a guard.
         model: the model that predicts, in float64.
-        delay: d, s, one or M.
+        dead_time: d, s, one or M.
         period: time between two calls, s.
-        actuator: limits of the input; an object of its own, since limits of the rate have a memory.
 
     Attributes:
-        ahead: time between a call and the reference that a caller gives, s: the longest d.
-        size: number n of inputs in the memory.
+        ahead: the longest d, s.
+        size: number n of inputs that wait or act at the end of the dead time.
     """
 
-    def __init__(
-        self,
-        law: Controller,
-        model: MechanicalSystem,
-        delay: ArrayLike,
-        period: PositiveFloat,
-        actuator: Actuator | None = None,
-    ):
-        super().__init__(law.num_coordinates, law.num_inputs)
-        self.law, self.model = law, model
-        self._actuator = actuator or Actuator()
-        self.period = period
-        delays = np.resize(np.asarray(delay, dtype=float), self.num_inputs)
-        self.ahead = float(delays.max())
-        self.size = n = math.ceil(self.ahead / period - 1e-6)
-        self._position = torch.from_numpy(n - (self.ahead - delays) / period)
-        # Input k of the memory acts between the ends k and k + 1, from now on.
+    def __init__(self, model: MechanicalSystem, dead_time: ArrayLike, period: float):
+        self.model = model
+        times = np.resize(np.asarray(dead_time, dtype=float), model.num_inputs)
+        self.ahead = float(times.max())
+        self.size = n = math.ceil(self.ahead / period - _ROUNDING)
+        self._position = torch.from_numpy(n - (self.ahead - times) / period)
+        # Input k of the last n acts between the ends k and k + 1, from now on.
         ends = np.maximum(self.ahead + period * np.arange(-n, 1), 0.0)
         self._lengths = torch.from_numpy(np.diff(ends))
-        self.reset()
-
-    def reset(self) -> None:
-        self.law.reset()
-        self._actuator.reset()
-        self._reference: Reference | None = None
-        self._past: Tensor | None = None
-        self._time = -math.inf
-
-    def follow(self, reference: Reference) -> None:
-        self._reference = reference
-        self.law.follow(reference)
 
     def predict(self, q: Tensor, v: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
         """Return q and v after the dead time, from the last n inputs ``(*batch, n, M)``."""
-        substeps = self.model.integrator.substeps
-        for u, length in zip(past.unbind(-2), self._lengths, strict=True):
-            for _ in range(substeps):
-                q, v = held_step(self.model, q, v, u, length / substeps)
+        model = sharing(self.model)
+        substeps = model.integrator.substeps
+        lengths = (self._lengths / substeps).unsqueeze(-1).expand(*past.shape[:-1], 1)
+        rows = torch.cat([past, lengths], dim=-1).repeat_interleave(substeps, dim=-2)
+
+        def step(x: Tensor, row: Tensor) -> Tensor:
+            h = row.reshape(-1, row.shape[-1])[0, -1]  # the same for all states
+            q, v = x.chunk(2, dim=-1)
+            return torch.cat(held_step(model, q, v, row[..., :-1], h), dim=-1)
+
+        q, v = repeated("step", step, torch.cat([q, v], dim=-1), rows).chunk(2, dim=-1)
         return q, v
 
-    def applied(self, past: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the input to apply ``(*batch, M)`` and the last n inputs, with u the latest."""
-        inputs = torch.cat([past, u.unsqueeze(-2)], dim=-2)
-        number = torch.arange(self.num_inputs)
+    def held_back(self, inputs: Tensor) -> Tensor:
+        """Return the input to apply ``(*batch, M)``, of the last n and the new one."""
+        number = torch.arange(inputs.shape[-1])
         before, after = self._position.floor().long(), self._position.ceil().long()
-        held_back = inputs[..., before, number].lerp(
-            inputs[..., after, number], self._position - before
-        )
-        return held_back, inputs[..., 1:, :]
-
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return u ``(*batch, M)``.
-
-        The reference is that at t + d, if the law does not follow one.
-
-        Raises:
-            ValueError: if the time since the previous call is not the period.
-        """
-        if math.isfinite(self._time) and abs(t - self._time - self.period) > 1e-6 * self.period:
-            raise ValueError(
-                f"t is {t:g} s after {self._time:g} s, expected steps of the period {self.period:g}"
-                " s: give the law the period of the loop, and reset() it before a new run"
-            )
-        self._time = t
-        past = self._past
-        if past is None or past.shape[:-2] != q.shape[:-1]:
-            past = q.new_zeros(*q.shape[:-1], self.size, self.num_inputs)
-        with torch.no_grad():
-            q, v = self.predict(q, v, past)
-        if self._reference is not None:
-            reference = motion_of_copies(self._reference, t + self.ahead, q)
-        u = self.law(t + self.ahead, q, v, reference)
-        limited, _ = self._actuator(u, self.period)
-        held_back, self._past = self.applied(past, limited)
-        return torch.where(self._position == self.size, u, held_back)
-
-    def diagnostics(self) -> dict[str, Tensor]:
-        return self.law.diagnostics()
-
-    def faults(self) -> dict[str, Tensor]:
-        return self.law.faults()
-
-
-def compensated(
-    law: Controller,
-    model: MechanicalSystem,
-    delay: ArrayLike,
-    rate: float | None,
-    actuator: Actuator | None = None,
-) -> Controller:
-    """Return the law at a rate in 1/s with a :class:`DelayCompensation` if inputs act late."""
-    if not np.any(delay):
-        return law
-    if rate is None:
-        raise ValueError(
-            f"inputs act up to {np.max(delay):g} s late, which a law in continuous time cannot "
-            "compensate: give a rate"
-        )
-    return DelayCompensation(law, model, delay, 1 / rate, copy.deepcopy(actuator))
+        return inputs[..., before, number].lerp(inputs[..., after, number], self._position - before)

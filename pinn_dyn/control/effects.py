@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor
 
-_Values = float | Sequence[float] | None
+Values = float | Sequence[float] | Tensor
+"""One number for all inputs, or M of them."""
 _Deviation = NonNegativeFloat | Sequence[NonNegativeFloat]
 
 
@@ -20,7 +21,7 @@ class Actuator:
 
         low <= u <= high,    |u(t_k) - u(t_k-1)| <= rate (t_k - t_k-1)
 
-    The input is zero before the first instant. If the rate cannot reach the range, the range wins.
+    If the rate cannot reach the range, the range wins.
 
     Args:
         low, high: limits in the units of u, one number or M; None for no limit.
@@ -30,37 +31,26 @@ class Actuator:
         ValueError: if low exceeds high, or is NaN.
     """
 
-    low: _Values = None
-    high: _Values = None
-    rate: PositiveFloat | Sequence[PositiveFloat] | None = None
-    _previous: Tensor | None = field(default=None, init=False, repr=False)
+    low: Values | None = None
+    high: Values | None = None
+    rate: PositiveFloat | Sequence[PositiveFloat] | Tensor | None = None
 
     def __post_init__(self) -> None:
         low = -np.inf if self.low is None else np.asarray(self.low)
         if not np.all(low <= (np.inf if self.high is None else np.asarray(self.high))):
             raise ValueError(f"Actuator: low {self.low} and high {self.high}, expected low <= high")
 
-    def reset(self) -> None:
-        """Return to an input of zero, before a new run."""
-        self._previous = None
-
-    def limit(self, u: Tensor, previous: Tensor | None = None, interval: float = 0.0) -> Tensor:
-        """Limit u ``(*batch, M)``, ``interval`` s after the input ``previous``; NaN stays NaN.
+    def limit(self, u: Tensor, previous: Tensor | None = None, period: float = 0.0) -> Tensor:
+        """Limit u ``(*batch, M)``, a period after the input ``previous``; NaN stays NaN.
 
         The rate is not limited without ``previous``.
         """
         if self.rate is not None and previous is not None:
-            change = interval * _like(self.rate, u)
+            change = period * _like(self.rate, u)
             u = u.clamp(previous - change, previous + change)
         low = -torch.inf if self.low is None else self.low
         high = torch.inf if self.high is None else self.high
         return u.clamp(_like(low, u), _like(high, u))
-
-    def __call__(self, u: Tensor, interval: float) -> tuple[Tensor, Tensor]:
-        """Limit u ``(*batch, M)``, ``interval`` s after the previous call; also mask changes."""
-        previous = torch.zeros_like(u) if self._previous is None else self._previous
-        self._previous = self.limit(u, previous, interval)
-        return self._previous, self._previous != u
 
 
 @dataclass
@@ -93,5 +83,5 @@ class Sensor:
         return value + _like(deviation, value) * noise.to(value)
 
 
-def _like(value: float | Sequence[float], tensor: Tensor) -> Tensor:
+def _like(value: Values, tensor: Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=tensor.dtype, device=tensor.device)

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
-from pinn_dyn.control.contracts import Controller
+from pinn_dyn.control.contracts import Stage
 from pinn_dyn.control.effects import Actuator
-from pinn_dyn.control.safe_law import SafeLaw
+from pinn_dyn.control.pipeline import Pipeline
 from pinn_dyn.exports.exported import (
     ENDINGS,
     ExportedFunction,
@@ -24,34 +22,36 @@ INPUTS = ("q", "v", "q_ref", "v_ref", "a_ref")
 
 
 def export_law(
-    controller: Controller,
+    law: Stage | Pipeline,
     path: str | Path,
     *,
     actuator: Actuator | None = None,
     period: float | None = None,
     real: Real = "double",
+    run: Any = None,
     about: Mapping[str, Any] | None = None,
     ranges: Ranges | None = None,
 ) -> Path:
     """Write a law to a ``.c`` (with ``.h``), ``.onnx`` or ``.casadi`` file, see docs/realtime.md.
 
-    The file holds the :class:`~.safe_law.SafeLaw`, which is the law with its observer, its guard
-    and the limits of the input, and explicit memory. That of a LatentLaw includes its estimate.
+    The file holds the :class:`~.pipeline.Pipeline` of the law, the same function as in a closed
+    loop: all stages, the dead time of the run of the model, the limits, and explicit memory.
 
     Args:
-        controller: a law of a model in float64 on the CPU, also with an observer or a guard.
+        law: a law of a model in float64 on the CPU, also with stages around it, or its pipeline.
         path: the file.
-        actuator: limits of the input.
-        period: time between two calls, s; limits of the rate and observers need it.
+        actuator: limits of the input of a law.
+        period: time between two calls of a law, s; limits of the rate, a dead time and stages with
+            a memory need it.
         real: type of the numbers of a ``.c`` or ``.onnx`` file.
-        about: fields for the information in the file. Names and units of coordinates and inputs are
-            those of the model of a run.
+        run: run with the dead time and the names of a law on ``run.model``; a law on
+            ``run.system`` remembers them.
+        about: fields for the information in the file.
         ranges: smallest and largest q, v and a of the states of the comparison, by name.
 
     Raises:
         ValueError: on another ending, or a missing period.
-        TypeError: on a controller that is not a law of a model, or an operation that the format
-            does not have.
+        TypeError: on a law that runs in Python only, or an operation that the format does not have.
         RuntimeError: if the file cannot be compiled or loaded, or does not repeat the law to 1e-9
             (float: 1e-4).
     """
@@ -59,37 +59,39 @@ def export_law(
     if path.suffix not in ENDINGS:
         endings = ", ".join(ENDINGS)
         raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
-    safe = SafeLaw(controller, actuator, period)
-    model, n = safe.law.model, safe.law.num_coordinates
-    inputs = drawn_states({**dict.fromkeys(INPUTS, n), "memory_in": safe.memory_size}, ranges)
-    begin = safe.stored_inputs
-    if safe.observer or safe.latent:
-        inputs["memory_in"][:, begin : begin + 1].round_()  # called before or not
+    names = {} if run is None else {"q": run.labels, "u": run.input_labels}
+    if isinstance(law, Pipeline):
+        pipeline = law
+    else:
+        dead_time = None if run is None else run.input_delay
+        pipeline = Pipeline(law, period, actuator=actuator, dead_time=dead_time)
+    if pipeline.law.is_python:
+        raise TypeError(
+            f"{type(pipeline.law).__name__} runs in Python and cannot be exported, expected a law "
+            "such as Tracking or LatentLaw"
+        )
+    n = pipeline.num_coordinates
+    inputs = drawn_states({**dict.fromkeys(INPUTS, n), "memory_in": pipeline.memory_size}, ranges)
+    model, limits = pipeline.law.model, pipeline.actuator
     info = {
-        "law": type(safe.law).__name__,
-        "observer": safe.observer and {"bandwidth": safe.observer.bandwidth},
-        "guard": safe.guard
-        and {key: getattr(safe.guard, key) for key in ("threshold", "fallback")},
-        "limits": {key: getattr(safe.actuator, key) for key in ("low", "high", "rate")},
-        "period": period,
-        "reference_ahead": safe.compensation.ahead if safe.compensation else 0.0,
+        **pipeline.law.about(),
+        "limits": {key: getattr(limits, key) for key in ("low", "high", "rate")},
+        "period": None if pipeline.period != pipeline.period else pipeline.period,
+        "dead_time": pipeline.dead_time,
+        "reference_ahead": pipeline.ahead[0],
         "num_coordinates": n,
-        "num_inputs": safe.law.num_inputs,
-        "memory_size": safe.memory_size,
-        **{key: _listed(getattr(safe.law, key)) for key in ("position_gain", "velocity_gain")},
-        **({"dead_time": safe.latent.dead_time} if safe.latent else {}),
+        "num_inputs": pipeline.num_inputs,
+        "memory_size": pipeline.memory_size,
         **({"q": [*model.labels], "u": [*model.input_labels]} if model.labels else {}),
+        **names,
         **(about or {}),
     }
     text = (
-        "Input u of the law. Returns the sum of 1 (limited), 2 (outside the training data) and 4 "
-        "(not finite: the last input). Zero memory_in before the first call, then memory_out."
+        "Input u of the law. Returns the sum of 1 (limited), 2 (outside the training data), 4 "
+        "(not finite: the last input), 8 (singular input matrix) and 16 (no input gives the "
+        "force). Zero memory_in before the first call, then memory_out."
     )
-    if safe.compensation:
-        text += f" q_ref, v_ref and a_ref are the reference {safe.compensation.ahead:g} s ahead."
-    law = ExportedFunction("control", safe, inputs, ("u", "status", "memory_out"), text)
-    return write([law], path, info, real)
-
-
-def _listed(gain: Tensor | float) -> float | list[float]:
-    return gain.tolist() if isinstance(gain, Tensor) else gain
+    if pipeline.ahead[0]:
+        text += f" q_ref, v_ref and a_ref are the reference {pipeline.ahead[0]:g} s ahead."
+    outputs = ("u", "status", "memory_out")
+    return write([ExportedFunction("control", pipeline, inputs, outputs, text)], path, info, real)

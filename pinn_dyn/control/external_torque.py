@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pinn_dyn.control.observer import DisturbanceObserver, rest_speeds
+from pinn_dyn.control.observer import MomentumObserver, rest_speeds
 from pinn_dyn.exports.exported import ExportedFunction, Ranges, drawn_states
 from pinn_dyn.mechanics import MechanicalSystem
 
@@ -17,7 +17,7 @@ def external_torque_function(
 ) -> ExportedFunction:
     """Return ``external_torque(q, v, u, bandwidth, h, memory_in)`` -> tau_ext, memory_out.
 
-    It is one call of :class:`~.observer.DisturbanceObserver` in a control loop of period h, with
+    It is one call of :class:`~.observer.MomentumObserver`, h seconds after the previous call, with
     the measured state and the input that acts at the same instant.
 
     Args:
@@ -30,18 +30,19 @@ def external_torque_function(
     def external_torque(q: Tensor, v: Tensor, *values: Tensor) -> tuple[Tensor, Tensor]:
         *inputs, bandwidth, h, memory = values
         u = inputs[0] if inputs else q.new_zeros(0)
-        observer = DisturbanceObserver(model, bandwidth, rest=rest)
-        residual, finish = observer.estimate(q, v, u, memory, h)
-        return residual, finish(u)
+        observer = MomentumObserver(model, bandwidth, rest=rest)
+        driven = observer.driven(q, v, u)
+        residual, memory = observer.estimate(q, v, torch.zeros_like(q), driven, memory, h)
+        before, force, band = memory.tensor_split([1 + 2 * n, 1 + 3 * n])  # the start of the next
+        return residual, torch.cat([before, force + driven, band])
 
     usual = {
         "bandwidth": (torch.tensor(20.0, dtype=double), torch.tensor(100.0, dtype=double)),
         "h": (torch.tensor(5e-4, dtype=double), torch.tensor(1.5e-3, dtype=double)),
     }
-    memory_size = DisturbanceObserver(model, 1.0, rest=rest).memory_size
+    memory_size = MomentumObserver(model, 1.0, rest=rest).memory_size
     sizes = {"q": n, "v": n, "u": m, "bandwidth": None, "h": None, "memory_in": memory_size}
     states = drawn_states({k: x for k, x in sizes.items() if x != 0}, {**usual, **(ranges or {})})
-    states["memory_in"][:, :1].round_()  # called before or not
     about = (
         "External torque of the joints, h seconds after the previous call, through a low-pass of "
         "the bandwidth in 1/s. Zero memory_in before the first call, then memory_out."

@@ -11,9 +11,8 @@ import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Controller, Motion
+from pinn_dyn.control.contracts import Motion, Setting, Stage, Step
 from pinn_dyn.control.effects import Actuator
-from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import CoupledOscillators
 
@@ -24,12 +23,12 @@ _ROUNDING = 1e-9  # of periods
 _RANK = 1e-3  # singular values below this share of the largest are zero
 
 
-class LatentLaw(Controller):
+class LatentLaw(Stage):
     r"""Regulation and tracking in the coordinates z of :class:`CoupledOscillators`::
 
         u = u_d + K_P psi (z_d - z) + K_D psi (z_d' - z'),    psi = S C^+ F^T,    C = F^T H^-1 F
         q(u_d) = q_s - d,    z_d = z(u_d),    z_d' = H^-1 F J^+ v_ref,    J = dq/du
-        dq_s/dt = v_ref + max(K_I, 0.2/T) (q_ref - q_s),    q_s = q at the first call
+        dq_s/dt = v_ref + max(K_I, 0.2/T) (q_ref - q_s),    q_s = q before the first call
 
     q(u) and z(u) are the equilibrium of the model under a constant input u. F = df/du at u_d and
     the Hessian H of the potential belong to z_d. Inputs are divided by their standard deviations S
@@ -58,19 +57,29 @@ class LatentLaw(Controller):
     Source: Stölzle and Della Santina (2024) for the shaped potential and the collocated damping;
     Pannocchia and Rawlings (2003), "Disturbance models for offset-free model-predictive control".
 
+    The report has ``static_residual``, |q(u_d) - q_s + d| in standard deviations of q.
+
     Args:
         model: the model, in float64.
         position_gain: K_P, a factor of the stiffness against the inputs, without a unit.
         velocity_gain: K_D, s.
         integral_gain: K_I, 1/s.
-        dead_time: time after which an input acts, s.
+        dead_time: time after which an input acts, s; None for that of the pipeline.
         noise: standard deviation of measured q, in those of the training data.
         first_input: input before the first call, one number or M.
-        actuator: limits of u; an object of its own, since limits of the rate have a memory.
 
     Raises:
         TypeError: on another model.
     """
+
+    needs_period, predicts = True, True
+    _actuator: Actuator
+    _first_target: Tensor
+    _gain: Tensor
+    _flow: tuple[Tensor, Tensor]
+    _wait: tuple[Tensor, Tensor]
+    _stored: int
+    _sizes: list[int]
 
     def __init__(
         self,
@@ -79,34 +88,44 @@ class LatentLaw(Controller):
         velocity_gain: NonNegativeFloat = 0.0,
         integral_gain: PositiveFloat = 10.0,
         *,
-        dead_time: NonNegativeFloat = 0.0,
+        dead_time: NonNegativeFloat | None = None,
         noise: Annotated[float, Field(gt=0)] = 0.01,
         first_input: float | list[float] = 0.0,
-        actuator: Actuator | None = None,
     ):
         if not isinstance(model, CoupledOscillators):
             raise TypeError(f"model is a {type(model).__name__}, expected CoupledOscillators")
         super().__init__(model.num_coordinates, model.num_inputs)
         self.model, self.dead_time, self.noise = model, dead_time, noise
+        self._late = dead_time or 0.0
         self.position_gain, self.velocity_gain = float(position_gain), float(velocity_gain)
         self.integral_gain = float(integral_gain)
-        self.actuator = actuator or Actuator()
-        self._first_input = torch.as_tensor(first_input, dtype=torch.float64)
+        self.first_input = first_input
         M, N = self.num_inputs, self.num_coordinates
-        self._u_mean, self._u_std = model.mean[-M:], model.std[-M:]
-        self._q_std, self._center = model.std[:N], model.linearize(model.mean[-M:])
-        self._first_target = model.rest(self._first_input.expand(M))[0]
-        n = len(model.bias)
-        self._sizes = [1, 2 * n, N, N, M, n]
-        self.memory_size = sum(self._sizes)
-        self.prepare(model.fixed_step)
-        self.reset()
+        self._u_std, self._q_std = model.std[-M:], model.std[:N]
+        self._center = model.linearize(model.mean[-M:])
 
-    def reset(self) -> None:
-        self._time, self._is_second_call = math.nan, False
-        self._memory = self._u_mean.new_zeros(0, 0, 0, 0)
-        self._residual: Tensor | None = None
-        self._past = self._first_input
+    def at(self, setting: Setting) -> LatentLaw:
+        law: LatentLaw = super().at(setting)
+        period = setting.period
+        law._actuator = setting.actuator
+        law._late = setting.dead_time if self.dead_time is None else self.dead_time
+        law._first_target = self.model.rest(setting.first_input)[0]
+        law._gain, _ = self.observer_gain(period)
+        law._flow = self.model.flow(period / self.model.fixed_step)
+        law._wait = self.model.flow(law._late / self.model.fixed_step)
+        law._stored = int(law._late / period + _ROUNDING) + 1
+        n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
+        law._sizes = [2 * n, N, N, M, n, law._stored * M]
+        law.memory_size = sum(law._sizes)
+        return law
+
+    def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return x, d, q_s, u_d and z_d at rest with a known input, and the inputs before it."""
+        past = (x.repeat(*[1] * (x.ndim - 1), self.model.past_steps) for x in (q, u))
+        x = self.model.start(q, v, u, *past)[..., : 2 * len(self.model.bias)]
+        z_d = self._first_target.expand(*x.shape[:-1], -1)
+        d = q - self.model.observe(x)
+        return torch.cat([x, d, q, u, z_d, *[u] * self._stored], dim=-1)
 
     def observer_gain(self, period: PositiveFloat) -> tuple[Tensor, Tensor]:
         """Return L ``(2n + N, N)`` and the matrix of the error of (x, d) for a period in s."""
@@ -130,125 +149,37 @@ class LatentLaw(Controller):
         """Return the eigenvalues of the error of the observer over a period in s."""
         return np.linalg.eigvals(self.observer_gain(period)[1].numpy())
 
-    def prepare(self, period: PositiveFloat) -> None:
-        """Compute the constants of a period in s."""
-        self._period = period
-        self._gain, _ = self.observer_gain(period)
-        self._flow = self.model.flow(period / self.model.fixed_step)
-        self._wait = self.model.flow(self.dead_time / self.model.fixed_step)
-        self.stored_inputs = int(self.dead_time / period + _ROUNDING) + 2
-        gains = self.position_gain, self.velocity_gain, self.integral_gain, self.noise
-        settings = period, self.dead_time, gains, self.actuator, self._first_input.tolist()
-        self._compiled = Compiled(self.model, settings)
-
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
-
-        Raises:
-            ValueError: if the period changes.
-        """
-        batch, M = q.shape[:-1], self.num_inputs
-        with torch.no_grad():
-            is_first = self._memory.shape[:-1] != batch
-            if is_first:
-                self.reset()
-                self.prepare(self._period)
-                self._memory = q.new_zeros(*batch, self.memory_size)
-                self._past = self._first_input.expand(*batch, 1, M)
-            else:
-                self._require_period(t - self._time)
-            lacking = max(self.stored_inputs - self._past.shape[-2], 0)
-            older = self._past[..., :1, :].expand(*batch, lacking, M)
-            past = torch.cat([older, self._past], dim=-2)[..., -self.stored_inputs :, :]
-            motion = (x.expand_as(q) for x in reference[:2])
-            rows = torch.cat([q, v, *motion, past.flatten(-2), self._memory], dim=-1)
-            result = self._compiled.rows("law", self._row, rows)
-            sizes = [M, self.memory_size, 1]
-            u, self._memory, residual = result.split(sizes, dim=-1)
-            last = None if is_first else past[..., -1, :]
-            u = self.actuator.limit(u, last, self._period)
-        self._past = torch.cat([past, u.unsqueeze(-2)], dim=-2)
-        self._time, self._residual = t, residual[..., 0]
-        self._is_second_call = is_first
-        return u
-
-    def goal(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return x at the end of the dead time, u_d and z_d of the latest call."""
-        _, x, _, _, u_d, z_d = self._memory.split(self._sizes, dim=-1)
-        with torch.no_grad():
-            return self._predicted(x, self._past[..., :-1, :]), u_d, z_d
-
-    def replace_input(self, u: Tensor) -> None:
-        """Store the input u ``(*batch, M)`` that acts instead of that of the latest call."""
-        self._past = torch.cat([self._past[..., :-1, :], u.unsqueeze(-2)], dim=-2)
-
-    def _require_period(self, period: float) -> None:
-        """Prepare the period at the second call, and refuse another one later."""
-        is_same = abs(period - self._period) <= 1e-6 * self._period
-        if not is_same and not self._is_second_call:
-            time = self._time + period
-            raise ValueError(f"the period of the law changed at {time:g} s: reset() the law before")
-        if not is_same:
-            self.prepare(float(f"{period:.9g}"))
-
-    def _row(self, rows: Tensor) -> Tensor:
-        N, M = self.num_coordinates, self.num_inputs
-        stored = self.stored_inputs * M
-        sizes = [N, N, N, N, stored, self.memory_size]
-        q, v, q_ref, v_ref, past, memory = rows.split(sizes, dim=-1)
-        past = past.unflatten(-1, (-1, M))
-        return torch.cat(self.law_of(q, v, q_ref, v_ref, past, memory), dim=-1)
-
-    def law_of(
-        self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, past: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return u without limits, the memory after the call and the residual.
-
-        The operations do not depend on the numbers, so that the law has a file.
-
-        Args:
-            q, v, q_ref, v_ref: measurement and reference, ``(*batch, N)``.
-            past: last inputs, the latest last, ``(*batch, stored_inputs, M)``.
-            memory: ``(*batch, S)``, which is zero before the first call: 1, x, d, q_s, u_d and z_d.
-        """
-        started, x, d, q_s, u_d, z_d = memory.split(self._sizes, dim=-1)
-        is_later = started > 0.5
-        past = self.past_of(past, memory)
-        first = self._first(q, v, self._first_input.expand(u_d.shape))
-        later = (*self._observed(q, x, d, past), u_d, z_d)
-        x, d, u_d, z_d = (torch.where(is_later, *y) for y in zip(later, first, strict=True))
+    def step(
+        self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
+    ) -> Step:
+        """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
+        x, d, q_s, u_d, z_d, before = memory.split(self._sizes, dim=-1)
+        past = before.unflatten(-1, (-1, self.num_inputs))
+        past = torch.cat([past, applied.unsqueeze(-2)], dim=-2)
+        x, d = self._observed(q, x, d, past)
         at = self.model.linearize(u_d, z_d, _NEWTON_STEPS)
         F = at.input * self._u_std
         compliant = torch.cholesky_solve(F, torch.linalg.cholesky_ex(at.stiffness).L)
         rate = max(self.integral_gain, _BANDWIDTH / self.model.fixed_step)
-        decay = math.exp(-rate * self._period)
-        q_s = torch.where(is_later, q_ref + decay * (q_s + self._period * v_ref - q_ref), q)
+        decay = math.exp(-rate * self.period)
+        target, v_ref, _ = (y.expand_as(q) for y in reference)
+        q_s = target + decay * (q_s + self.period * v_ref - target)
         error = (q_s - d - at.q) / self._q_std
         J = at.output[..., : at.z.shape[-1]] / self._q_std[:, None] @ compliant
         inverse = torch.linalg.pinv(J, rtol=_RANK)
         change = self._u_std * matvec(inverse, error).clamp(-1.0, 1.0)
-        u_d = self.actuator.limit(u_d + change)
+        u_d = self._actuator.limit(u_d + change)
         rate_d = matvec(compliant @ inverse, v_ref / self._q_std)
-        slopes, wanted = (F, compliant), (at.z, rate_d, u_d)
-        u = u_d + self._u_std * self._feedback(self._predicted(x, past), is_later, *slopes, *wanted)
-        memory = torch.cat([torch.ones_like(started), x, d, q_s, u_d, at.z], dim=-1)
-        return u, memory, error.square().sum(-1, keepdim=True).sqrt()
-
-    def past_of(self, past: Tensor, memory: Tensor) -> Tensor:
-        """Return the last inputs, which are the first input before the first call."""
-        return torch.where(memory[..., :1, None] > 0.5, past, self._first_input.expand(past.shape))
-
-    def _first(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, ...]:
-        """Return x, d, u_d and z_d at rest with a known input."""
-        past = (x.repeat(*[1] * (x.ndim - 1), self.model.past_steps) for x in (q, u))
-        x = self.model.start(q, v, u, *past)[..., : 2 * len(self.model.bias)]
-        z_d = self._first_target.expand(*x.shape[:-1], -1)
-        return x, q - self.model.observe(x), u, z_d
+        predicted = self._predicted(x, past)
+        feedback = self._feedback(predicted, F, compliant, at.z, rate_d, u_d)
+        memory = torch.cat([x, d, q_s, u_d, at.z, past[..., 1:, :].flatten(-2)], dim=-1)
+        residual = error.square().sum(-1).sqrt()
+        return Step(u_d + self._u_std * feedback, memory, {"static_residual": residual})
 
     def _observed(self, q: Tensor, x: Tensor, d: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
         """Move the estimate by a period with the inputs that acted, after its correction."""
-        whole = self.stored_inputs - 2
-        share = self.dead_time / self._period - whole  # of the period, for the older input
+        whole = self._stored - 1
+        share = self._late / self.period - whole  # of the period, for the older input
         newer, older = past[..., -1 - whole, :], past[..., -2 - whole, :]
         moved = self._moved(x, self._flow, newer.lerp(older, share))
         error = (q - self.model.observe(moved) - d) / self._q_std
@@ -261,40 +192,27 @@ class LatentLaw(Controller):
 
     def _predicted(self, x: Tensor, past: Tensor) -> Tensor:
         """Return the state at the end of the dead time, under the mean input until then."""
-        if not self.dead_time:
+        if not self._late:
             return x
-        waiting = math.ceil(self.dead_time / self._period - _ROUNDING)
+        waiting = math.ceil(self._late / self.period - _ROUNDING)
         return self._moved(x, self._wait, past[..., -waiting:, :].mean(-2))
 
     def _feedback(
-        self,
-        x: Tensor,
-        is_later: Tensor,
-        F: Tensor,
-        compliant: Tensor,
-        z_d: Tensor,
-        rate_d: Tensor,
-        u_d: Tensor,
+        self, x: Tensor, F: Tensor, compliant: Tensor, z_d: Tensor, rate_d: Tensor, u_d: Tensor
     ) -> Tensor:
         """Return (u - u_d) / S from the mean state of the coming period, which it changes.
 
-        At the first call, it takes the present state. ``compliant`` is H^-1 F.
+        ``compliant`` is H^-1 F.
         """
         psi = torch.linalg.pinv(F.mT @ compliant, rtol=_RANK, hermitian=True) @ F.mT
         # Velocities and the velocity gain are those per step of the model.
-        step = self.model.fixed_step
-        z, rate = x.chunk(2, dim=-1)
-        later = self._moved(x, self._flow, u_d)[..., : z.shape[-1]]
-        rate = torch.where(is_later, (later - z) * step / self._period, rate)
-        ratio = self._period / step * is_later.to(x)  # not of the default dtype
-        position, velocity = self.position_gain, self.velocity_gain / step
-        wanted = position * (z_d - z - ratio / 2 * rate) + velocity * (step * rate_d - rate)
-        effect = self._flow[1][: z.shape[-1]] @ F / (self._period / step)
-        change = (ratio.unsqueeze(-1) / 2 * position + velocity) * psi @ effect
-        change = is_later.unsqueeze(-1) * change
+        ratio = self.period / self.model.fixed_step
+        z, _ = x.chunk(2, dim=-1)
+        rate = (self._moved(x, self._flow, u_d)[..., : z.shape[-1]] - z) / ratio
+        position, velocity = self.position_gain, self.velocity_gain / self.model.fixed_step
+        wanted = position * (z_d - z - ratio / 2 * rate)
+        wanted = wanted + velocity * (self.model.fixed_step * rate_d - rate)
+        effect = self._flow[1][: z.shape[-1]] @ F / ratio
+        change = (ratio / 2 * position + velocity) * psi @ effect
         one = torch.eye(self.num_inputs).to(change)
         return torch.linalg.solve(one + change, matvec(psi, wanted).unsqueeze(-1))[..., 0]
-
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return ``static_residual``: |q(u_d) - q_s + d| in standard deviations of q."""
-        return {} if self._residual is None else {"static_residual": self._residual}

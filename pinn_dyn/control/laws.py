@@ -10,22 +10,16 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Controller, Motion
-from pinn_dyn.exports.compiled import Compiled
+from pinn_dyn.control.contracts import Motion, Stage, Step
+from pinn_dyn.exports.program import is_traced
 from pinn_dyn.mechanics import InputSolver, MechanicalSystem
-from pinn_dyn.mechanics.arrays import (
-    jacobians,
-    matvec,
-    pseudo_inverse_times,
-    require_last_dim,
-)
-from pinn_dyn.mechanics.input_solver import Solution
+from pinn_dyn.mechanics.arrays import jacobians, matvec, pseudo_inverse_times
 
 Gain = float | Sequence[float] | Tensor
 """One positive number for all coordinates, or N of them."""
 
 
-class ModelBasedLaw(Controller):
+class ModelBasedLaw(Stage):
     """A law u = law(q, v, q_ref, v_ref, a_ref) on the terms of a model.
 
     The gains are diagonal, and A^+(q) is the pseudo-inverse of the input matrix of the model.
@@ -38,11 +32,15 @@ class ModelBasedLaw(Controller):
 
     The force f(q, v, u) is not linear in u for tendons with motor positions as inputs, and for
     servos that saturate. The solution u* of f(q, v, u*) = tau then replaces A^+ tau, and the
-    Jacobian J = df/du at u* replaces A. :class:`InputSolver` starts from the previous u, which is
-    the only memory of the law. If there is no u*, the law returns the previous u and has a fault.
+    Jacobian J = df/du at u* replaces A. :class:`InputSolver` starts from the last input. If there
+    is no u*, the law returns the last input and has the mark ``unreachable``.
     With a model equal to the plant, the force is tau + J J^T (K_P e + K_D de/dt) up to second order
     in the feedback. Near a set point, the law is stable as with A A^T if J has full rank. This does
     not hold far from the set point or with slack tendons.
+
+    The report has ``input_condition``, the :func:`condition_number` of A(q) or J, the mark
+    ``singular`` above ``max_condition``, and for a force that is not linear in u
+    ``input_residual``, |f(q, v, u*) - tau| in the units of the force.
 
     Args:
         model: the mechanical system whose terms the law uses, in float64.
@@ -77,73 +75,19 @@ class ModelBasedLaw(Controller):
         self.position_gain = diagonal_gain("position_gain", position_gain, self.num_coordinates)
         self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, self.num_coordinates)
         self.model = model
-        self._compiled = Compiled(type(self), model, self.position_gain, self.velocity_gain)
+        self.is_long = not model.input_affine  # it takes all steps of the solver
         self.max_condition = float(max_condition)
         self.solver = solver or InputSolver()
-        self.reset()
 
-    def reset(self) -> None:
-        self._condition: Tensor | None = None
-        self._previous: Tensor | None = None
-        self._solution: Solution | None = None
-
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+    def step(
+        self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
+    ) -> Step:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
-        require_last_dim("q", q, self.num_coordinates, "N")
-        require_last_dim("v", v, self.num_coordinates, "N")
-        for name, value in zip(reference._fields, reference, strict=True):
-            require_last_dim(f"reference.{name}", value, self.num_coordinates, "N")
-        previous = self._previous
-        if previous is not None and previous.shape[:-1] != q.shape[:-1]:
-            previous = None
-        with torch.no_grad():
-            if self.model.input_affine and type(self).__module__ == __name__:
-                u, A = self._affine_input(q, v, reference)
-            else:
-                u, A, self._solution = self._input(q, v, reference, previous)
-            self._condition = condition_number(A)
-        if not self.model.input_affine:
-            self._previous = u
-        return u
+        tau, feedback = self._forces(q, v, reference)
+        return self._input(q, v, tau, feedback, applied, memory)
 
-    def _affine_input(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
-        """Return u and A for a force that is linear in u, in C if that pays off."""
-        rows = torch.cat([x.expand_as(q) for x in (q, v, *reference)], dim=-1)
-
-        def function(x: Tensor) -> Tensor:
-            q, v, *motion = x.chunk(5, dim=-1)
-            u, A, _ = self._input(q, v, Motion(*motion), None)
-            return torch.cat([u, A.flatten(-2)], dim=-1)
-
-        u, A = self._compiled.rows("input", function, rows).split(
-            [self.num_inputs, self.num_coordinates * self.num_inputs], dim=-1
-        )
-        return u, A.unflatten(-1, (self.num_coordinates, self.num_inputs))
-
-    def law(
-        self,
-        q: Tensor,
-        v: Tensor,
-        q_ref: Tensor,
-        v_ref: Tensor,
-        a_ref: Tensor,
-        u_previous: Tensor | None = None,
-    ) -> Tensor:
-        """Return u ``(*batch, M)`` by the formula alone, without checks and side effects.
-
-        If the force is not linear in u, the solver takes all its steps from ``u_previous``, the u
-        of the previous instant. u is NaN where no input gives the force.
-
-        Raises:
-            ValueError: on such a force without ``u_previous``.
-        """
-        if u_previous is None and not self.model.input_affine:
-            raise ValueError(
-                "the force of the model is not linear in u: the law needs u_previous, the u of the "
-                "previous instant, as its sixth argument"
-            )
-        reference = Motion(q_ref, v_ref, a_ref)
-        return self._input(q, v, reference, u_previous, all_steps=True)[0]
+    def stiffness(self) -> tuple[Tensor, Tensor] | None:
+        return self.position_gain, self.velocity_gain
 
     @abc.abstractmethod
     def _forces(
@@ -155,12 +99,11 @@ class ModelBasedLaw(Controller):
         self,
         q: Tensor,
         v: Tensor,
-        reference: Motion,
-        previous: Tensor | None,
-        all_steps: bool = False,
-    ) -> tuple[Tensor, Tensor, Solution | None]:
-        """Return u, A or J ``(*batch, N, M)``, and the solution for a force not linear in u."""
-        tau, feedback = self._forces(q, v, reference)
+        tau: Tensor | None,
+        feedback: Tensor | None,
+        applied: Tensor,
+        memory: Tensor,
+    ) -> Step:
         model, solution = self.model, None
         if model.input_affine:
             A = model.input_matrix(q)
@@ -170,48 +113,22 @@ class ModelBasedLaw(Controller):
             A = jacobians(lambda x: model._applied_force(q, v, x), u)[1][0]
         else:
             tau = model._reachable_force(q, v, tau)
-            solution = model.solve_input(self.solver, q, v, tau, previous, all_steps=all_steps)
+            solution = model.solve_input(self.solver, q, v, tau, applied, all_steps=is_traced())
             u, A = solution.u, solution.J
         if feedback is not None:
             u = u + matvec(A.transpose(-1, -2), feedback)
+        condition = condition_number(A)
+        report = {"input_condition": condition, "singular": ~(condition <= self.max_condition)}
         if solution is not None:
-            held = model.typical_input(q) if previous is None else previous
-            # NaN for a NaN state, and for the formula alone.
-            held = held + (torch.nan if all_steps else 0 * solution.residual.unsqueeze(-1))
-            u = torch.where(solution.converged.unsqueeze(-1), u, held)
-        return u, A, solution
+            missing = ~solution.converged
+            held = applied + 0 * solution.residual.unsqueeze(-1)  # NaN for a NaN state
+            u = torch.where(missing.unsqueeze(-1), held, u)
+            report = {**report, "input_residual": solution.residual, "unreachable": missing}
+        return Step(u, memory, report)
 
     def _feedback(self, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         K_P, K_D = self.position_gain.to(q), self.velocity_gain.to(q)
         return K_P * (reference.q - q) + K_D * (reference.v - v)
-
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return ``input_condition``, the condition number of A(q) or J, ``(*batch,)``.
-
-        ``input_residual`` is |f(q, v, u*) - tau| in the units of the force, not linear in u.
-        """
-        if self._condition is None:
-            return {}
-        numbers = {"input_condition": self._condition}
-        if self._solution is not None:
-            numbers["input_residual"] = self._solution.residual
-        return numbers
-
-    def faults(self) -> dict[str, Tensor]:
-        """Return, by reason, where A(q) or J is nearly singular or NaN, or u* does not exist."""
-        if self._condition is None:
-            return {}
-        if self._solution is not None and not self._solution.converged.all():
-            reason = (
-                f"no input gives the force of the law to {self.solver.tolerance:g} within "
-                f"{self.solver.steps} steps, so the previous input is held"
-            )
-            return {reason: ~self._solution.converged}
-        reason = (
-            "the input matrix A(q) is nearly singular: its condition number exceeds "
-            f"max_condition = {self.max_condition:g}"
-        )
-        return {reason: ~(self._condition <= self.max_condition)}
 
 
 class ProportionalDerivative(ModelBasedLaw):
@@ -273,16 +190,26 @@ class ComputedTorque(ModelBasedLaw):
     damped. Arguments and errors: :class:`ModelBasedLaw`.
     """
 
+    def stiffness(self) -> None:
+        """Return None: the gains are in 1/s^2 and 1/s."""
+
     def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, None]:
         a = reference.a + self._feedback(q, v, reference)
         return self.model.inverse_dynamics(q, v, a), None
 
 
 def condition_number(A: Tensor) -> Tensor:
-    """Return the condition number of A, ``(*batch,)``; NaN where A is zero or not finite."""
-    # svdvals refuses a whole batch for one NaN, so it gets none; the sum brings the NaN back.
-    values = torch.linalg.svdvals(torch.nan_to_num(A, nan=0.0, posinf=0.0, neginf=0.0))
-    return values[..., 0] / values[..., -1] + 0 * A.sum((-2, -1))
+    """Return |A| |A^+| / r in the Frobenius norm, with r = min(N, M), ``(*batch,)``.
+
+    It is 1 for an orthogonal matrix, between 1/r and 1 of the ratio of singular values, and NaN or
+    infinite where A loses its rank or is not finite.
+    """
+    square = A.mT @ A if A.shape[-1] < A.shape[-2] else A @ A.mT
+    size = square.shape[-1]
+    factor, failed = torch.linalg.cholesky_ex(square)
+    inverse = torch.linalg.solve_triangular(factor, torch.eye(size).to(A), upper=False)
+    product = A.square().sum((-2, -1)) * inverse.square().sum((-2, -1))
+    return torch.where(failed == 0, product.sqrt() / size, torch.inf)
 
 
 def diagonal_gain(name: str, value: Gain, size: int) -> Tensor:

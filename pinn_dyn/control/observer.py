@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from pydantic import PositiveFloat
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Controller, Motion
-from pinn_dyn.control.effects import Actuator
-from pinn_dyn.control.laws import ModelBasedLaw
+from pinn_dyn.control.contracts import Motion, Stage, Step, Wrapper
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec, pseudo_inverse_times
 from pinn_dyn.models import CoulombFriction
@@ -20,167 +17,77 @@ from pinn_dyn.models import CoulombFriction
 _CHUNK = 4096  # samples whose terms are computed at once
 
 
-class DisturbanceObserver(Controller):
-    """A law with a generalized-momentum observer that corrects the law's model.
-
-    The disturbance d is the force that the model's terms do not explain: errors of M, G, D, F and
-    A, a payload, a contact. The observer's residual r estimates d and corrects the input::
+class MomentumObserver:
+    """The generalized-momentum observer of the force d that the terms of a model do not explain::
 
         dp/dt = f(q, v) + A(q) u + d,   p = M(q) v,   f = d(v^T M v / 2)/dq - G - D v - F(v)
-        r(t) = K_O (p(t) - p(0) - integral from 0 to t of (f + A u + r) ds),   u = u_law - A^+(q) r
+        r(t) = K_O (p(t) - p(0) - integral from 0 to t of (f + A u + r) ds)
 
-    so dr/dt = K_O (d - r): r is d through a first-order low-pass. With u_k held over a period T::
+    so dr/dt = K_O (d - r): r is d through a first-order low-pass. Over a period T::
 
         r_k+1 = r_k + limited((1 - exp(-K_O T)) (d_k - r_k)),   r_0 = 0
-        d_k = (p_k+1 - p_k) / T - (f_k + f_k+1 + (A_k + A_k+1) u_k) / 2
+        d_k = (p_k+1 - p_k) / T - (f_k + f_k+1 + A_k u_k + A_k+1 u_k+1) / 2
 
-    where each entry is limited to max_rate T, and T is the time between two calls.
+    where each entry is limited to max_rate T. The force of the inputs need not be linear in u.
 
-    :meth:`estimate` and :meth:`observe` give r alone, without a law. With ``rest``, the law is that
-    of sticking rollouts (:class:`~pinn_dyn.mechanics.sliding.Sliding`): dry friction is sliding
-    friction, and anything between both directions for joints slower than ``rest`` or that reverse.
-    In d_k, it is the value in this range that brings r_k+1 closest to zero.
-
-    Stability for a square A: with a = 1 - exp(-K_O T) and mu the largest eigenvalue of M_L M^-1
-    (model M_L, plant M), the loop is stable for a mu < 2. An unknown dead time of n periods reduces
-    this for M_L = M to a < 2 sin(pi / (4 n + 2)). Beyond, r alternates within max_rate T.
-
-    Assumptions: d changes little within 1 / K_O, u reaches the plant at once, and A has full rank.
+    With ``rest``, the law is that of sticking rollouts, see
+    :class:`~pinn_dyn.mechanics.sliding.Sliding`: dry friction is sliding friction, and anything
+    between both directions for joints slower than ``rest`` or that reverse. In d_k, it is the value
+    in this range that brings r_k+1 closest to zero.
 
     Source: De Luca and Mattone 2005, Sensorless robot collision detection and hybrid force/motion
     control; Haddadin, De Luca, Albu-Schaeffer 2017, Robot collisions: a survey. Not in the paper.
 
     Args:
-        law: the law to correct; the observer uses its model and its A^+. A model alone gives an
-            observer that has no law to correct.
+        model: the model.
         bandwidth: K_O, 1/s.
         max_rate: largest rate of change of each entry of r, N/s or Nm/s; None for no limit.
-        actuator: limits of the plant's input, so that r does not wind up in saturation. Give an
-            object of its own, since limits of the rate have a memory. u itself is not limited.
         rest: speed below which a joint counts as at rest, ``(N,)``, rad/s or m/s; None for none.
 
-    Raises:
-        ValueError: on a law of a model whose force is not linear in the input.
-
     Attributes:
-        residual: r of the latest call, ``(*batch, N)``, N or Nm; None before the first call.
-        bandwidth, max_rate: as above; the rate is infinite without a limit.
+        memory_size: length of the memory of :meth:`estimate`.
     """
-
-    law: ModelBasedLaw
-    _finish: Callable[[Tensor], Tensor]
-    _u: Tensor
 
     def __init__(
         self,
-        law: ModelBasedLaw | MechanicalSystem,
-        bandwidth: PositiveFloat | Tensor,
+        model: MechanicalSystem,
+        bandwidth: float | Tensor,
         *,
-        max_rate: PositiveFloat | None = None,
-        actuator: Actuator | None = None,
+        max_rate: float | None = None,
         rest: Tensor | None = None,
     ):
-        super().__init__(law.num_coordinates, law.num_inputs)
-        if isinstance(law, MechanicalSystem):
-            self.model = law
-        else:
-            self.law, self.model = law, law.model
-            if not law.model.input_affine:
-                raise ValueError(
-                    "the observer needs a force A(q) u: remove controllers.<law>.observer"
-                )
-        self.bandwidth = bandwidth
-        self.rest = rest
+        self.model, self.bandwidth, self.rest = model, bandwidth, rest
         self.max_rate = math.inf if max_rate is None else float(max_rate)
-        self._actuator = actuator
-        self.memory_size = 1 + (3 if rest is None else 5) * law.num_coordinates
-        self._forget()
-
-    def reset(self) -> None:
-        self.law.reset()
-        self._forget()
-
-    def _forget(self) -> None:
-        self.residual: Tensor | None = None
-        self._time, self._period = -math.inf, 1.0
-        if self._actuator is not None:
-            self._actuator.reset()
-
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
-
-        Raises:
-            ValueError: on a time before the previous call.
-        """
-        u_law = self.law(t, q, v, reference)
-        if t < self._time:
-            raise ValueError(
-                f"t is {t:g} s, before the previous call at {self._time:g} s: reset() the observer "
-                "before a new run, and give a rate, since it cannot act in continuous time"
-            )
-        with torch.no_grad():
-            if self.residual is None or self.residual.shape != q.shape:
-                self._forget()
-                self._memory = q.new_zeros(*q.shape[:-1], self.memory_size)
-                self._applied = torch.zeros_like(u_law)
-            elif t > self._time:
-                self._period, self._applied = t - self._time, self._u
-                if self._actuator is not None:
-                    self._applied, _ = self._actuator(self._u, self._period)
-                self._memory = self._finish(self._applied)
-            u, self._finish = self.correct(q, v, u_law, self._applied, self._memory, self._period)
-            self.residual = self._finish(u)[..., 1 : q.shape[-1] + 1]
-        self._time, self._u = t, u
-        self._size = torch.linalg.vector_norm(u_law - u, dim=-1)
-        return u
-
-    def correct(
-        self, q: Tensor, v: Tensor, u: Tensor, last: Tensor, memory: Tensor, period: float
-    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Correct the law's u ``(*batch, M)``, without side effects.
-
-        Args:
-            q, v: state, ``(*batch, N)``.
-            u: input of the law, ``(*batch, M)``.
-            last: input that was applied since the previous call, ``(*batch, M)``.
-            memory: zero before the first call; then 1, r, M v and (f + A u) / 2, side by side.
-            period: T, s.
-
-        Returns:
-            u - A^+ r, and a function from the applied input to the memory for the next call.
-        """
-        A = self.model.input_matrix(q)
-        residual, finish = self.estimate(q, v, last, memory, period, A)
-        return u - pseudo_inverse_times(A, residual), finish
+        self.memory_size = 1 + (3 if rest is None else 5) * model.num_coordinates
 
     def estimate(
         self,
         q: Tensor,
         v: Tensor,
-        last: Tensor,
+        begin: Tensor,
+        end: Tensor,
         memory: Tensor,
         period: float | Tensor,
-        A: Tensor | None = None,
-    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Return r and a function from the applied input to the memory for the next call.
+    ) -> tuple[Tensor, Tensor]:
+        """Return r and the memory for the next call, without side effects.
 
-        Arguments as for :meth:`correct`. A ``(*batch, N, M)`` saves its computation.
+        Args:
+            q, v: state, ``(*batch, N)``.
+            begin, end: force of the inputs at the start and the end of the period, ``(*batch, N)``.
+            memory: zero before the first call; then 1, r, M v, f and the bounds of dry friction.
+            period: T, s.
         """
         n = q.shape[-1]
         sizes = [1] + [n] * (self.memory_size // n)
         started, residual, last_momentum, last_force, *last_band = memory.split(sizes, dim=-1)
         momentum, force = self._momentum_and_force(q, v)
-        modeled = last_force + 0.5 * (force + self._driven(q, v, last, A))
+        modeled = 0.5 * (last_force + force + begin + end)
         disturbance = (momentum - last_momentum) / period - modeled
         band = self._friction_band(v)
         change = self._change(disturbance, residual, period, *_joined(band, last_band))
-        residual = residual + started * change
-
-        def finish(applied: Tensor) -> Tensor:
-            half = 0.5 * (force + self._driven(q, v, applied, A))
-            return torch.cat([torch.ones_like(started), residual, momentum, half, *band], dim=-1)
-
-        return residual, finish
+        residual = residual + torch.where(started > 0.5, change, 0.0)
+        one = torch.ones_like(started)
+        return residual, torch.cat([one, residual, momentum, force, *band], dim=-1)
 
     def observe(
         self, q: Tensor, v: Tensor, u: Tensor, period: float, *, hold: bool = False
@@ -197,7 +104,7 @@ class DisturbanceObserver(Controller):
         rows = zip(*(x.split(_CHUNK) for x in (q, v)), strict=True)
         parts = [self._momentum_and_force(*row) for row in rows]
         momentum, force = (torch.cat(x) for x in zip(*parts, strict=True))
-        ending, starting = (force + self._driven(q, v, x) for x in (before, u))
+        ending, starting = (force + self.driven(q, v, x) for x in (before, u))
         disturbance = momentum.diff(dim=0) / period - 0.5 * (ending[1:] + starting[:-1])
         band = self._friction_band(v)
         ranges = _joined([x[1:] for x in band], [x[:-1] for x in band])
@@ -214,14 +121,12 @@ class DisturbanceObserver(Controller):
         """
         momentum = self.model.momentum(q, v)
         state = torch.cat([q, momentum], dim=-1)
-        no_input = q.new_zeros(*q.shape[:-1], self.num_inputs)
+        no_input = q.new_zeros(*q.shape[:-1], self.model.num_inputs)
         force = self.model.momentum_derivative(state, no_input)[..., q.shape[-1] :]
         return momentum, force if self.rest is None else force + self.model._friction_force(v)
 
-    def _driven(self, q: Tensor, v: Tensor, u: Tensor, A: Tensor | None = None) -> Tensor:
+    def driven(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force that the input adds, ``(*batch, N)``."""
-        if A is not None:
-            return matvec(A, u)
         no_input = self.model._applied_force(q, v, torch.zeros_like(u))
         return self.model._applied_force(q, v, u) - no_input
 
@@ -246,18 +151,71 @@ class DisturbanceObserver(Controller):
         limit: Any = self.max_rate * period
         return change.clamp(-limit, limit) if math.isfinite(self.max_rate) else change
 
-    def replace_input(self, u: Tensor) -> None:
-        """Set the input that acts in place of that of the latest call, ``(*batch, M)``."""
-        self._u = u
 
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return the law's diagnostics and ``compensation``, |A^+ r| in the units of u."""
-        if self.residual is None:
-            return {}
-        return self.law.diagnostics() | {"compensation": self._size}
+class DisturbanceObserver(Wrapper):
+    """A law with a :class:`MomentumObserver` that corrects the law's model::
 
-    def faults(self) -> dict[str, Tensor]:
-        return self.law.faults()
+        u = u_law - A^+(q) r
+
+    The disturbance is the force that the model's terms do not explain: errors of M, G, D, F and A,
+    a payload, a contact. The observer takes the input that was applied, so that limits of the
+    actuator do not count as a disturbance.
+
+    Stability for a square A: with a = 1 - exp(-K_O T) and mu the largest eigenvalue of M_L M^-1
+    (model M_L, plant M), the loop is stable for a mu < 2. An unknown dead time of n periods reduces
+    this for M_L = M to a < 2 sin(pi / (4 n + 2)). Beyond, r alternates within max_rate T.
+
+    Assumptions: d changes little within 1 / K_O, u reaches the plant at once, and A has full rank.
+
+    The report has ``compensation``, |A^+ r| in the units of u.
+
+    Args:
+        law: the law to correct; the observer uses its model and its A^+.
+        bandwidth: K_O, 1/s.
+        max_rate: largest rate of change of each entry of r, N/s or Nm/s; None for no limit.
+
+    Raises:
+        TypeError: on a law without a mechanical system.
+        ValueError: on a law of a model whose force is not linear in the input.
+    """
+
+    def __init__(
+        self,
+        law: Stage,
+        bandwidth: PositiveFloat,
+        *,
+        max_rate: PositiveFloat | None = None,
+    ):
+        model = law.model
+        if not isinstance(model, MechanicalSystem):
+            raise TypeError(
+                f"the observer needs a model with terms M, G and A, and {type(law).__name__} has "
+                f"{'none' if model is None else 'a ' + type(model).__name__}: remove the observer"
+            )
+        if not model.input_affine:
+            raise ValueError("the observer needs a force A(q) u: remove controllers.<law>.observer")
+        self.observer = MomentumObserver(model, bandwidth, max_rate=max_rate)
+        n, m = model.num_coordinates, model.num_inputs
+        self._sizes = [self.observer.memory_size, n * m, m]
+        super().__init__(law, sum(self._sizes))
+
+    def about(self) -> dict[str, Any]:
+        return {**self.law.about(), "observer": {"bandwidth": self.observer.bandwidth}}
+
+    def step(
+        self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
+    ) -> Step:
+        own, last, change, inner = memory.split([*self._sizes, self.law.memory_size], dim=-1)
+        u, after, report = Step(*self.law.step(q, v, reference, applied + change, inner))
+        A = self.model.input_matrix(q)
+        last = last.unflatten(-1, A.shape[-2:])
+        begin, end = (matvec(x, applied) for x in (last, A))
+        residual, own = self.observer.estimate(q, v, begin, end, own, self.period)
+        compensation = pseudo_inverse_times(A, residual)
+        size = compensation.square().sum(-1).sqrt()
+        A = A.flatten(-2).expand(*q.shape[:-1], -1)
+        memory = torch.cat([own, A, compensation, after], dim=-1)
+        return Step(u - compensation, memory, {**report, "compensation": size})
 
 
 def _joined(band: list[Tensor], last_band: list[Tensor]) -> tuple[Tensor, ...]:

@@ -6,15 +6,15 @@ import logging
 import math
 import time
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Controller, Motion, Reference
-from pinn_dyn.control.effects import Actuator
+from pinn_dyn.control.contracts import Motion, Stage, Step
+from pinn_dyn.control.effects import Actuator, Values
 from pinn_dyn.control.shooting import Limits, Plan, ShootingProblem, Weights
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import pseudo_inverse_times
@@ -24,32 +24,27 @@ log = logging.getLogger(__name__)
 _FIRST_ITERATIONS = 20  # times as many iterations at the first instant, without a previous plan
 _LARGEST_GAP = 0.1  # largest gap of a plan that counts as a solution
 _LIMIT_WEIGHT = 1e3  # rho of a violated limit of the state
-_Values = float | Sequence[float] | None
+_Values = Values | None
 Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
 """Weight of all coordinates or inputs, or of each."""
 
 
-class _Memory(NamedTuple):
-    t: float
-    x: np.ndarray
-    u: np.ndarray
-    d: np.ndarray
-    plan: Plan | None
-    failures: int
-
-
-class PredictiveControl(Controller):
+class PredictiveControl(Stage):
     """Model predictive control with limits, through CasADi (``pip install 'pinn_dyn[mpc]'``).
 
     With a C compiler, the model is compiled first, which takes some seconds.
 
     At each instant, the law plans a motion over the horizon by :class:`ShootingProblem`, starting
-    from the previous plan, and applies its first input. The plan follows the future reference,
-    within limits of the state, if the loop calls :meth:`follow`, as :func:`close_loop` does.
+    from the previous plan, and applies its first input. The plan follows the reference at the times
+    ``ahead``, or a reference of one time, within limits of the state.
 
     u_ref is A^+ times the inverse dynamics of the reference, within the limits. It is zero for a
     force that is not linear in the input. If the solver fails, as for a state that is not finite,
     the law holds the last input.
+
+    The report has ``solve_time`` in s, ``iterations``, ``solver_failed`` and ``missed_deadline``,
+    for a call that takes longer than the period, and the mark ``no_plan`` after failures for longer
+    than the horizon.
 
     Args:
         model: the mechanical system to plan with, in float64.
@@ -66,13 +61,12 @@ class PredictiveControl(Controller):
         observer_bandwidth: K_O in 1/s of an observer of the acceleration d that the model does not
             explain, d_k+1 = d_k + (1 - exp(-K_O T)) (measured - d_k); None for d = 0.
 
-    Attributes:
-        plans: the latest plan of each run, None where the solver failed.
-
     Raises:
         ImportError: without CasADi.
         ValueError: on values that do not fit N or M, crossed limits, or a horizon below two steps.
     """
+
+    needs_period, is_python = True, True
 
     def __init__(
         self,
@@ -94,7 +88,7 @@ class PredictiveControl(Controller):
     ):
         n, m = model.num_coordinates, model.num_inputs
         super().__init__(n, m)
-        self.model, self.step = model, float(step)
+        self.model, self.step_size = model, float(step)
         steps = round(horizon / step)
         if steps < 2:
             raise ValueError(f"horizon is {horizon} s, expected two steps of {step} s or more")
@@ -119,11 +113,14 @@ class PredictiveControl(Controller):
             _row("rate_weight", rate_weight, m),
             _LIMIT_WEIGHT,
         )
-        self.problem = ShootingProblem(model, self.step, steps, self.weights, self.limits)
+        self.problem = ShootingProblem(model, self.step_size, steps, self.weights, self.limits)
         self._terminal, self._iterations = terminal_weight, iterations
         self._bandwidth = observer_bandwidth
-        self._reference: Reference | None = None
-        self.reset()
+        self.ahead = tuple(self.step_size * k for k in range(steps + 1))
+        # Called before, x, d, failures in a row, has a plan, and the plan.
+        self._sizes = [1, 2 * n, n, 1, 1, 2 * n * steps, m * steps]
+        self.memory_size = sum(self._sizes)
+        self._references: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def _state_weight(self, position: Weight, velocity: Weight) -> np.ndarray:
         """Return the factor of Q, see :class:`~.shooting.Weights`."""
@@ -131,69 +128,51 @@ class PredictiveControl(Controller):
         values = [_row(name, value, self.num_coordinates) for name, value in rows]
         return np.diag(np.sqrt(np.concatenate(values)))
 
-    def reset(self) -> None:
-        self._memory: list[_Memory] = []
-        self._diagnostics: dict[str, Tensor] = {}
-        self._references: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-
-    def follow(self, reference: Reference) -> None:
-        self._reference = reference
-
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+    def step(
+        self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
+    ) -> Step:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
 
         Raises:
-            ValueError: on a time before the previous call, a first state beyond its limits, or a
-                time or reference that is not finite.
+            ValueError: on a first state beyond its limits, or a reference that is not finite.
         """
-        if not math.isfinite(t):
-            raise ValueError(f"t is {t}, expected the time of the call in s")
-        states = torch.cat([q, v], -1).reshape(-1, 2 * self.num_coordinates).double().cpu().numpy()
-        if not self._memory:
-            self._start(t, states)
-        elif len(self._memory) != len(states) or t < self._memory[0].t:
-            raise ValueError(
-                f"t is {t:g} s for {len(states)} runs, after {self._memory[0].t:g} s for "
-                f"{len(self._memory)}: reset() the law before new runs, and set a rate, since it "
-                "cannot act in continuous time"
-            )
-        begin = time.perf_counter()
-        ahead = self._ahead(t, len(states), reference)
-        shared = (time.perf_counter() - begin) / len(states)
+        begin, batch = time.perf_counter(), q.shape[:-1]
+        x, u, rows = (
+            y.detach().double().cpu().reshape(-1, y.shape[-1]).numpy()
+            for y in (torch.cat([q, v], -1), applied, memory)
+        )
+        values = list(zip(*(np.split(rows, np.cumsum(self._sizes)[:-1], axis=1)), strict=True))
+        self._require_feasible(x, rows[:, 0] < 0.5)
+        ahead = self._ahead(len(x), reference)
+        shared = (time.perf_counter() - begin) / len(x)
         with np.errstate(invalid="ignore"):  # of a state that is not finite
-            values = [self._advance(k, t, x, *(y[k] for y in ahead)) for k, x in enumerate(states)]
-        self._diagnostics = {
-            key: q.new_tensor([value[key] for value in values]).reshape(q.shape[:-1])
-            for key in values[0]
+            calls = [
+                self._advance(k, values[k], x[k], u[k], *(y[k] for y in ahead))
+                for k in range(len(x))
+            ]
+        inputs, memories, reports = zip(*calls, strict=True)
+        report = {
+            key: q.new_tensor([values[key] for values in reports]).reshape(batch)
+            for key in reports[0]
         }
-        self._diagnostics["solve_time"] += shared
-        u = np.stack([memory.u for memory in self._memory])
-        return torch.from_numpy(u).to(q).reshape(*q.shape[:-1], self.num_inputs)
+        report["solve_time"] += shared
+        report["no_plan"] = report.pop("failures") > self.problem.steps
+        result, after = (
+            torch.from_numpy(np.stack(y)).to(q).reshape(*batch, -1) for y in (inputs, memories)
+        )
+        return Step(result, after, report)
 
-    @property
-    def plans(self) -> list[Plan | None]:
-        return [memory.plan for memory in self._memory]
+    def plans(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the states ``(*batch, 2N, S)`` and inputs ``(*batch, M, S)`` of the last plans."""
+        x, u = memory.split(self._sizes, dim=-1)[-2:]
+        sizes = (-1, self.problem.steps)
+        return x.unflatten(-1, sizes), u.unflatten(-1, sizes)
 
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return ``solve_time`` in s, ``iterations``, ``solver_failed`` and ``missed_deadline``.
-
-        Both marks are 0 or 1. A deadline is missed if a call takes longer than the loop's period.
-        """
-        return self._diagnostics
-
-    def faults(self) -> dict[str, Tensor]:
-        """Return, by reason, the runs whose solver failed for longer than the horizon."""
-        if not self._diagnostics:
-            return {}
-        failed = self._diagnostics["solver_failed"]
-        count = torch.tensor([x.failures for x in self._memory]).reshape(failed.shape)
-        reason = "the solver found no plan for longer than the horizon"
-        return {reason: count > self.problem.steps}
-
-    def _start(self, t: float, states: np.ndarray) -> None:
-        """Forget the past; refuse states from which no plan is feasible."""
-        limits, n, m = self.limits, self.num_coordinates, self.num_inputs
+    def _require_feasible(self, states: np.ndarray, is_first: np.ndarray) -> None:
+        """Refuse first states from which no plan is feasible."""
+        limits, n = self.limits, self.num_coordinates
         outside = (states < limits.x_low - 1e-9) | (states > limits.x_high + 1e-9)
+        outside &= is_first[:, None]
         if outside.any():
             run, i = (int(x) for x in np.argwhere(outside)[0])
             name = f"q[{i}]" if i < n else f"v[{i - n}]"
@@ -201,25 +180,18 @@ class PredictiveControl(Controller):
                 f"no feasible plan: {name} of run {run} starts at {states[run, i]:.4g}, expected "
                 f"{limits.x_low[i]:.4g} to {limits.x_high[i]:.4g}: start inside, or widen the limit"
             )
-        u = np.zeros(m).clip(limits.u_low, limits.u_high)
-        self._memory = [_Memory(t, x, u, np.zeros(n), None, 0) for x in states]
 
-    def _ahead(
-        self, t: float, count: int, now: Motion
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _ahead(self, count: int, reference: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x_ref ``(K, 2N, S)``, u_ref ``(K, M, S)`` and P ``(K, 2N, 2N)`` of the plans."""
         problem, n = self.problem, self.num_coordinates
-        times = t + self.step * np.arange(problem.steps + 1)
-        motions = [now if self._reference is None else self._reference(float(x)) for x in times]
-        q, v, a = (
-            torch.stack([x.double().cpu().expand(count, n) for x in values], -2)
-            for values in zip(*motions, strict=True)
-        )
+        shape = count, problem.steps + 1, n
+        motions = [x if x.ndim > 2 else x.unsqueeze(-2) for x in reference]
+        q, v, a = (x.double().cpu().expand(shape) for x in motions)
         missing = (~torch.cat([q, v, a], -1).isfinite()).nonzero()
         if len(missing):
             _, step, k = missing[0].tolist()
             name = f"{'qva'[k // n]}[{k % n}]"
-            raise ValueError(f"the reference of {name} at {times[step]:g} s is not finite")
+            raise ValueError(f"the reference of {name} {self.ahead[step]:g} s ahead is not finite")
         # Beyond a limit, the weight of the goal would exceed that of the limit.
         states = torch.cat([q, v], -1).clip(*map(torch.from_numpy, self.limits[:2]))
         (q, v), x = states.split(n, -1), states.numpy()
@@ -245,63 +217,77 @@ class PredictiveControl(Controller):
             return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a)).numpy()
 
     def _advance(
-        self, k: int, t: float, x: np.ndarray, x_ref: np.ndarray, u_ref: np.ndarray, P: np.ndarray
-    ) -> dict[str, float]:
-        """Plan for a copy, store its input, and return its diagnostics."""
-        begin, problem, last = time.perf_counter(), self.problem, self._memory[k]
-        first = last.plan is None
-        period = t - last.t if t > last.t else self.step
-        d = self._disturbance(last, t, x)
+        self,
+        k: int,
+        memory: Sequence[np.ndarray],
+        x: np.ndarray,
+        last: np.ndarray,
+        x_ref: np.ndarray,
+        u_ref: np.ndarray,
+        P: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+        """Plan for a copy; return its input, its memory and its report."""
+        begin, problem, n = time.perf_counter(), self.problem, self.num_coordinates
+        (started,), x_last, d, (failures,), (has_plan,), *previous = memory
+        if started:
+            d = self._disturbance(x_last, last, d, x)
         if self._bandwidth is not None:
             slopes = problem.slopes(np.concatenate([x_ref[:, -1], u_ref[:, -1]])[None])[0]
-            u_ref = u_ref - (np.linalg.pinv(slopes[:, 2 * self.num_coordinates :]) @ d)[:, None]
-        iterations = self._iterations * (_FIRST_ITERATIONS if first else 1)
-        u, plan = last.u, None
+            u_ref = u_ref - (np.linalg.pinv(slopes[:, 2 * n :]) @ d)[:, None]
+        plan, u = None, last
+        if has_plan:
+            guess = self._shifted(previous)
+        else:  # a straight line to the reference, or rest after every second failure
+            share = np.linspace(1 / problem.steps, 1, problem.steps) * (failures % 2 == 0)
+            guess = x[:, None] + share * (x_ref - x[:, None]), u_ref
+        iterations = self._iterations * (1 if has_plan else _FIRST_ITERATIONS)
         try:
             plan = problem.solve(
-                *(x, last.u, d, x_ref, u_ref, P, self._guess(last, period, x, x_ref, u_ref)),
-                period=period,
-                iterations=iterations,
+                *(x, last, d, x_ref, u_ref, P, guess), period=self._time, iterations=iterations
             )
-            failed = not plan.gap <= _LARGEST_GAP
         except FloatingPointError:
-            failed = True
+            log.debug("no plan for run %d", k, exc_info=True)
+        failed = plan is None or not plan.gap <= _LARGEST_GAP
         if plan is not None and not failed:
             u = plan.u[:, 0].clip(self.limits.u_low, self.limits.u_high)
-            if first:
+            previous = [plan.x, plan.u]
+            if not has_plan:
                 self._warn_of_excess(k, plan)
-        failures = last.failures + 1 if failed else 0
-        self._memory[k] = _Memory(t, x, u, d, None if failed else plan, failures)
+        failures = failures + 1 if failed else 0
+        marks = np.array([float(failures), float(not failed)])
+        parts = [np.ones(1), x, d, marks, *(np.ravel(y) for y in previous)]
         duration = time.perf_counter() - begin
-        return {
+        report = {
             "solve_time": duration,
             "iterations": float(plan.iterations if plan else 0),
             "solver_failed": float(failed),
-            "missed_deadline": float(duration > period and not first),
+            "missed_deadline": float(duration > self._time and bool(has_plan)),
+            "failures": failures,
         }
+        return u, np.concatenate(parts), report
 
-    def _guess(
-        self, last: _Memory, period: float, x: np.ndarray, x_ref: np.ndarray, u_ref: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the previous plan, shifted in time, or the first guess.
+    @property
+    def _time(self) -> float:
+        """The period, or the step of a plan without one."""
+        return self.step_size if math.isnan(self.period) else self.period
 
-        The first guess is a straight line to the reference, or rest after every second failure.
-        """
+    def _shifted(self, plan: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return states and inputs of a plan a period later."""
         steps = self.problem.steps
-        if last.plan is None:
-            share = np.linspace(1 / steps, 1, steps) * (last.failures % 2 == 0)
-            return x[:, None] + share * (x_ref - x[:, None]), u_ref
-        shift = np.minimum(np.arange(steps) + round(period / self.step), steps - 1)
-        return last.plan.x[:, shift], last.plan.u[:, shift]
+        shift = np.minimum(np.arange(steps) + round(self._time / self.step_size), steps - 1)
+        x, u = (y.reshape(-1, steps)[:, shift] for y in plan)
+        return x, u
 
-    def _disturbance(self, last: _Memory, t: float, x: np.ndarray) -> np.ndarray:
-        if self._bandwidth is None or t <= last.t:
-            return last.d
-        n, period = self.num_coordinates, t - last.t
-        modeled = self.problem.accelerations(np.concatenate([(last.x + x) / 2, last.u]))
-        measured = (x[n:] - last.x[n:]) / period - modeled
-        d = last.d - math.expm1(-self._bandwidth * period) * (measured - last.d)
-        return d if np.isfinite(d).all() else last.d
+    def _disturbance(
+        self, x_last: np.ndarray, u: np.ndarray, d: np.ndarray, x: np.ndarray
+    ) -> np.ndarray:
+        if self._bandwidth is None:
+            return d
+        n = self.num_coordinates
+        modeled = self.problem.accelerations(np.concatenate([(x_last + x) / 2, u]))
+        measured = (x[n:] - x_last[n:]) / self._time - modeled
+        d_next = d - math.expm1(-self._bandwidth * self._time) * (measured - d)
+        return d_next if np.isfinite(d_next).all() else d
 
     def _warn_of_excess(self, k: int, plan: Plan) -> None:
         """Warn if the first plan cannot keep a limit of the state."""
@@ -311,7 +297,7 @@ class PredictiveControl(Controller):
             log.warning(
                 f"the first plan of run {k} leaves the limits of "
                 f"{f'q[{i}]' if i < n else f'v[{i - n}]'} by {plan.excess[i, step]:.3g} after "
-                f"{(step + 1) * self.step:.3g} s: no input within its limits avoids this"
+                f"{(step + 1) * self.step_size:.3g} s: no input within its limits avoids this"
             )
 
 

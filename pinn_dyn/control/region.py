@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy
@@ -13,12 +12,10 @@ import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Controller, Motion, Reference
-from pinn_dyn.control.laws import ComputedTorque, ModelBasedLaw, Regulation
-from pinn_dyn.control.observer import DisturbanceObserver
+from pinn_dyn.control.contracts import Motion, Stage, Step, Wrapper
+from pinn_dyn.control.laws import Regulation
+from pinn_dyn.exports.program import is_traced
 from pinn_dyn.mechanics.arrays import require_last_dim
-
-log = logging.getLogger(__name__)
 
 _COLUMN = 32  # states whose distances are compared side by side, see DataRegion.nearest
 FallBack = Literal["hold", "regulation"]
@@ -120,8 +117,10 @@ class DataRegion:
         return torch.cat([x[..., linear], angles.sin(), angles.cos()], dim=-1)
 
 
-class Guarded(Controller):
-    """A law with a guard, which warns once per run if a state is far from the training data.
+class Guarded(Wrapper):
+    """A law with a guard, which marks states far from the training data as ``outside``.
+
+    The report has ``distance``, the distance from the training data.
 
     Args:
         law: the law to guard.
@@ -136,75 +135,36 @@ class Guarded(Controller):
 
     def __init__(
         self,
-        law: Controller,
+        law: Stage,
         region: DataRegion,
         *,
         threshold: PositiveFloat = 2.0,
         fallback: FallBack | None = None,
     ):
-        super().__init__(law.num_coordinates, law.num_inputs)
-        self.law, self.region, self.threshold, self.fallback = law, region, threshold, fallback
-        self._observer = law if isinstance(law, DisturbanceObserver) else None
-        law = self._observer.law if self._observer else law
+        super().__init__(law)
+        self.region, self.threshold, self.fallback = region, threshold, fallback
+        gains = law.stiffness()
         if fallback == "regulation":
-            if not isinstance(law, ModelBasedLaw) or isinstance(law, ComputedTorque):
+            if gains is None:
                 raise ValueError(
                     f"fallback regulation needs gains in Nm/rad, and those of "
                     f"{type(law).__name__} have other units: use the fallback hold"
                 )
-            self._regulation = Regulation(law.model, law.position_gain, law.velocity_gain)
-        self.reset()
+            self._regulation = Regulation(law.model, *gains)
 
-    def reset(self) -> None:
-        self.law.reset()
-        self._distance: Tensor | None = None
-        self._last: Tensor | None = None
-        self._warned = False
+    def about(self) -> dict[str, Any]:
+        guard = {"threshold": self.threshold, "fallback": self.fallback}
+        return {**self.law.about(), "guard": guard}
 
-    def follow(self, reference: Reference) -> None:
-        self.law.follow(reference)
-
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        u = self.law(t, q, v, reference)
-        self._distance = self.region.distance(q, v)
-        last = torch.zeros_like(u) if self._last is None else self._last
-        u, outside = self.replaced(q, v, reference, u, last, self._distance)
-        if outside.any() and not self._warned:
-            self._warned = True
-            log.warning(
-                f"t = {t:.4g} s: {int(outside.sum())} of {outside.numel()} states are outside the "
-                f"training data, at distances up to {float(self._distance.nan_to_num().max()):.3g} "
-                f"(1: edge of the data, {self.threshold:g}: threshold of the guard)"
-            )
-        if self._observer:
-            self._observer.replace_input(u)
-        self._last = u
-        return u
-
-    def replaced(
-        self, q: Tensor, v: Tensor, reference: Motion, u: Tensor, last: Tensor, distance: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the law's u ``(*batch, M)``, replaced outside the data, and where that is.
-
-        Args:
-            q, v, reference: state and desired motion, ``(*batch, N)`` each.
-            u, last: input of the law, and the last input, ``(*batch, M)``.
-            distance: distance from the data, ``(*batch,)``.
-        """
+    def step(
+        self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
+    ) -> Step:
+        u, memory, report = Step(*self.law.step(q, v, reference, applied, memory))
+        distance = self.region.nearest(q, v) if is_traced() else self.region.distance(q, v)
         outside = distance > self.threshold
-        if self.fallback is None:
-            return u, outside
-        if self.fallback == "regulation":
-            with torch.no_grad():
-                last = self._regulation.law(q, v, *reference, last)
-        return torch.where(outside.unsqueeze(-1), last, u), outside
-
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return those of the law, ``distance``, and ``outside`` as 0 or 1."""
-        if self._distance is None:
-            return {}
-        outside = (self._distance > self.threshold).to(self._distance)
-        return self.law.diagnostics() | {"distance": self._distance, "outside": outside}
-
-    def faults(self) -> dict[str, Tensor]:
-        return self.law.faults()
+        if self.fallback is not None:
+            other = applied
+            if self.fallback == "regulation":
+                other = self._regulation.step(q, v, reference, applied, memory).u
+            u = torch.where(outside.unsqueeze(-1), other, u)
+        return Step(u, memory, {**report, "distance": distance, "outside": outside})

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from pinn_dyn.evaluation.control_figures import (
         closed_loop_figure,
         controller_comparison_figure,
-        steady_state_figure,
         tip_path_figure,
     )
     from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
@@ -59,7 +58,6 @@ __all__ = [
     "predict_trajectories",
     "rollout_metrics",
     "save",
-    "steady_state_figure",
     "sweep_figure",
     "terms_figure",
     "tip_path_figure",

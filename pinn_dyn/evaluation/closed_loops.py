@@ -15,16 +15,15 @@ from torch import Tensor
 from pinn_dyn.control import (
     Actuator,
     ClosedLoopRecord,
-    Controller,
+    Pipeline,
     Plant,
     Reference,
     Sensor,
     SimulatorPlant,
+    Stage,
     SystemPlant,
-    close_loop_continuous,
 )
-from pinn_dyn.control import close_loop as close_sampled_loop
-from pinn_dyn.control.dead_time import compensated
+from pinn_dyn.control import close_loop as close_one_loop
 from pinn_dyn.control.references import check_limits
 from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_metrics
 from pinn_dyn.evaluation.tables import write_table
@@ -79,14 +78,14 @@ class ControlResult:
 
 def close_loop(
     run: Any,
-    law: Callable[[MechanicalSystem], Controller],
+    law: Callable[[MechanicalSystem], Stage],
     reference: Reference,
     robot: MechanicalSystem,
     **settings: Any,
 ) -> ControlResult:
     """Control a robot by a law on a trained model, and by the same law on the robot's true terms.
 
-    Both laws compensate the delay of the run's data set, see :class:`.DelayCompensation`::
+    Both laws compensate the dead time of the run's data set, see :class:`.DeadTime`::
 
         law = functools.partial(Tracking, position_gain=100.0, velocity_gain=10.0)
         result = pinn_dyn.close_loop(run, law, Sines([0.2, 0.0, 0.1], 0.1, 0.5), SoftArm())
@@ -99,73 +98,73 @@ def close_loop(
         settings: keyword arguments of :func:`close_loops`.
     """
     systems = {"learned": double_copy(getattr(run, "model", run)), "truth": robot}
-    delay, rate = getattr(run, "input_delay", 0.0), settings.get("rate", RATE)
+    period, limits = 1 / settings.get("rate", RATE), settings.get("actuator")
+    dead_time = getattr(run, "input_delay", 0.0)
     laws = {
-        name: compensated(law(system), system, delay, rate, settings.get("actuator"))
+        name: Pipeline(law(system), period, actuator=limits, dead_time=dead_time)
         for name, system in systems.items()
     }
     return close_loops(laws, reference, robot, **settings)
 
 
 def close_loops(
-    laws: Mapping[str, Controller],
+    laws: Mapping[str, Stage | Pipeline],
     reference: Reference,
     robot: MechanicalSystem,
     *,
     duration: float = 2.0,
-    rate: float | None = RATE,
-    samples_rate: float = 200.0,
+    rate: float = RATE,
+    samples_rate: float | None = None,
     q0: Tensor | None = None,
     v0: Tensor | None = None,
     plant: Plant | None = None,
     actuator: Actuator | None = None,
     sensor: Sensor | None = None,
-    delay: float = 0.0,
+    dead_time: float = 0.0,
     settled_after: float | None = None,
     progress: bool = False,
 ) -> ControlResult:
     """Close the loop of each law on a robot and compare their errors and inputs.
 
     Args:
-        laws: control laws by name.
+        laws: control laws by name, or their pipelines.
         reference: the desired motion.
         robot: the true system.
         duration: length of the runs, s.
-        rate: control instants per second, 1/s; None for a law in continuous time.
-        samples_rate: samples per second of a continuous-time record, 1/s.
+        rate: control instants per second, 1/s.
+        samples_rate: samples of the records per second, 1/s; None for all instants.
         q0, v0: initial states, ``(K, N)`` each; None starts on the reference.
         plant: the simulation of the robot at control instants; None takes the simulator of a
             :class:`~pinn_dyn.systems.Stepped` robot, and solves the equation of motion of others.
         actuator: limits of the input.
         sensor: noise of the measurement.
-        delay: dead time of the input, control instants, also 1.5.
+        dead_time: time after which the robot's inputs act, s.
         settled_after: see :func:`closed_loop_metrics`.
         progress: log lines of progress.
 
     Raises:
-        ValueError: if the reference leaves the limits or the domain of the robot, or a law in
-            continuous time has a delay or noise.
+        ValueError: if the reference leaves the limits or the domain of the robot.
     """
     start = reference(0.0)
     if q0 is None or v0 is None:
         q0, v0 = (x.double().reshape(-1, reference.num_coordinates) for x in (start.q, start.v))
     _check_reference(reference, robot, q0, duration)
-    if rate is None and (delay or sensor is not None):
-        raise ValueError("a law in continuous time has no delay and no sensor noise: give a rate")
     if plant is None:
         plant = SimulatorPlant(robot) if isinstance(robot, Stepped) else SystemPlant(robot)
     records, metrics = {}, {}
     for name, law in laws.items():
-        common: dict[str, Any] = {"duration": duration, "actuator": actuator}
-        common["progress"] = f"closing the loop: {name}" if progress else None
-        if rate is None:
-            records[name] = close_loop_continuous(
-                robot, law, reference, q0, v0, samples_rate=samples_rate, **common
-            )
-        else:
-            records[name] = close_sampled_loop(
-                plant, law, reference, q0, v0, rate=rate, sensor=sensor, delay=delay, **common
-            )
+        pipeline = law
+        if isinstance(law, Stage):
+            pipeline = Pipeline(law, 1 / rate, actuator=actuator)
+        records[name] = close_one_loop(
+            *(plant, pipeline, reference, q0, v0),
+            duration=duration,
+            rate=rate,
+            sensor=sensor,
+            dead_time=dead_time,
+            samples_rate=samples_rate,
+            progress=f"closing the loop: {name}" if progress else None,
+        )
         metrics[name] = closed_loop_metrics(
             records[name],
             settled_after=settled_after,

@@ -12,7 +12,6 @@ from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop, stopped_runs
 from pinn_dyn.evaluation.tables import with_unit
 from pinn_dyn.plots import (
-    COLORS,
     DARK,
     TRUTH,
     default_labels,
@@ -39,7 +38,6 @@ def closed_loop_figure(
     title: str,
     labels: Sequence[str] | None = None,
     input_labels: Sequence[str] | None = None,
-    held: bool = True,
 ) -> Figure:
     """Draw one run: configuration over the dotted reference, the error, and the inputs.
 
@@ -49,7 +47,6 @@ def closed_loop_figure(
         laws: names of laws and K runs of each.
         run: index of the run.
         labels, input_labels: names and units; None takes q1 ... qN and u1 ... uM.
-        held: the input is constant between two control instants.
     """
     first = next(iter(laws.values()))
     labels = default_labels(labels, "q", first.q.shape[-1])
@@ -72,8 +69,7 @@ def closed_loop_figure(
         for k, ax in enumerate(coordinates):
             ax.plot(record.t, record.q[run, :, k], label=name, **style)
         for k, ax in enumerate(inputs):
-            drawstyle = "steps-post" if held else "default"
-            ax.plot(record.t, record.u[run, :, k], drawstyle=drawstyle, **style)
+            ax.plot(record.t, record.u[run, :, k], drawstyle="steps-post", **style)
         error_panel.plot(record.t, control_errors(record)[run], **style)
         if record.stopped[run] is not None:
             end = float(record.t[samples_before_stop(record, run) - 1])
@@ -117,32 +113,4 @@ def tip_path_figure(
     ax.grid(True, alpha=0.3)
     legend_below(figure)
     figure.suptitle(title)
-    return figure
-
-
-def steady_state_figure(
-    bound: Tensor, measured: Tensor, *, title: str, label: str = ERROR
-) -> Figure:
-    """Draw the steady-state error of each set point against its predicted bound, on log axes.
-
-    The bound holds below the diagonal. Both are ``(K,)`` in the units of q; values that are not
-    finite are not drawn. ``label`` is the name and unit of the error.
-    """
-    drawn = torch.isfinite(bound) & torch.isfinite(measured)
-    x, y = (values[drawn].double().clamp(min=1e-12) for values in (bound, measured))  # log axes
-    above = y > x
-    figure = Figure(figsize=(6.5, 6.0), layout="constrained")
-    ax = figure.subplots()
-    ax.set(xscale="log", yscale="log", aspect="equal")
-    ax.scatter(x[~above], y[~above], s=28, color=COLORS[0], label="below its bound")
-    ax.scatter(x[above], y[above], s=40, color=COLORS[1], marker="x", label="above its bound")
-    if len(x):
-        ends = (0.5 * float(torch.minimum(x, y).min()), 2 * float(torch.maximum(x, y).max()))
-        ax.plot(ends, ends, "--", color="0.4", linewidth=1, label="error = bound")
-        ax.set(xlim=ends, ylim=ends)
-    ax.grid(True, alpha=0.3)
-    ax.set(xlabel=f"predicted bound on {label}", ylabel=f"measured {label}")
-    ax.legend(loc="lower right", fontsize="small")
-    title += f"\n{int((~above).sum())} of {int(bound.isfinite().sum())} bounds hold"
-    figure.suptitle(title, fontsize="medium")
     return figure

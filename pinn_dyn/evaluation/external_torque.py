@@ -14,7 +14,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from pinn_dyn.control.observer import DisturbanceObserver, rest_speeds
+from pinn_dyn.control.observer import MomentumObserver, rest_speeds
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels, save
@@ -95,15 +95,15 @@ def observed_torques(
 ) -> tuple[Tensor, Tensor]:
     """Return the external torque r and the drive torque after the same low-pass, ``(T, N)`` each.
 
-    r is the residual of :class:`~pinn_dyn.control.DisturbanceObserver`: the part of the momentum's
-    rate that neither the drives nor the model explain, through a low-pass of 1 / K_O s.
+    r is the residual of :class:`~pinn_dyn.control.observer.MomentumObserver`: the part of the
+    momentum's rate that neither the drives nor the model explain, through a low-pass of 1 / K_O s.
     """
-    observer = DisturbanceObserver(model, bandwidth, rest=rest_speeds(model))
+    observer = MomentumObserver(model, bandwidth, rest=rest_speeds(model))
     q, v, u = (x.double() for x in (motion.q, motion.v, motion.u))
     period = float(motion.t[1] - motion.t[0])
     with torch.no_grad():
         residual = observer.observe(q, v, u, period, hold=motion.input.interpolation == "hold")
-        drive = observer._driven(q, v, u)
+        drive = observer.driven(q, v, u)
     gain = -math.expm1(-bandwidth * period)
     filtered = scipy.signal.lfilter([gain], [1, gain - 1], (drive - drive[0]).numpy(), axis=0)
     return residual, drive[0] + torch.from_numpy(filtered)

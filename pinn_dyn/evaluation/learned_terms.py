@@ -9,7 +9,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.control.stability import fit_factor
 from pinn_dyn.data import DataSource
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Terms, double_copy
 
@@ -22,7 +21,7 @@ class TermComparison:
         names: K names of configurations.
         q: configurations, ``(K, N)``.
         true, learned: M, D, G, A of the true system and of the model.
-        P: best-fit factor, ``(K, N, N)``, see :func:`pinn_dyn.control.stability.fit_factor`.
+        P: best-fit factor, ``(K, N, N)``, see :func:`fit_factor`.
         of_inverse_mass: the equations of the model, in (q, p), contain the inverse of M.
     """
 
@@ -94,6 +93,44 @@ def compare_with_source(model: Predictor, source: DataSource) -> TermComparison 
         return None
     q = torch.tensor([source.configurations[name] for name in names], dtype=torch.float64)
     return compare_terms(model, system, q, names=names)
+
+
+def fit_factor(true: Terms, learned: Terms) -> Tensor:
+    """Fit the factor P(q), ``(*batch, N, N)``, between learned and true terms::
+
+        P = argmin  sum_X |P X - X_L|^2 / |X|^2,     X in {M, D, A, G}
+
+    with Frobenius norms. A true term that vanishes is left out; where P is not unique, the P of
+    smallest norm is returned. Motion determines the terms only up to such a P.
+
+    Source: paper, section PINN-based controllers, X_L = P X. The column P(q) of the paper's table
+    holds the inverse.
+    """
+    true, learned = (x._replace(G=x.G.unsqueeze(-1)) for x in (true, learned))
+    norms = [torch.linalg.matrix_norm(X)[..., None, None] for X in true]
+    weights = [torch.where(norm > 0, 1 / norm, 0.0) for norm in norms]
+    X, X_L = (
+        torch.cat([weight * x for weight, x in zip(weights, terms, strict=True)], -1)
+        for terms in (true, learned)
+    )
+    return X_L @ torch.linalg.pinv(X)
+
+
+def term_conditions(model: MechanicalSystem, q: Tensor) -> pd.DataFrame:
+    """Return the conditioning of the terms of a model at configurations q ``(K, N)``, a row each.
+
+    Next to ``q1`` to ``qN`` there are ``mass_min`` and ``damping_min``, the smallest eigenvalues of
+    M and D, and ``mass_condition`` and ``input_condition``, condition numbers in the 2-norm.
+    """
+    with torch.no_grad():
+        terms = double_copy(model, q.device).terms(q.double())
+    columns = {f"q{i + 1}": value for i, value in enumerate(q.unbind(-1))} | {
+        "mass_min": torch.linalg.eigvalsh(terms.M)[..., 0],
+        "damping_min": torch.linalg.eigvalsh(0.5 * (terms.D + terms.D.mT))[..., 0],
+        "mass_condition": torch.linalg.cond(terms.M),
+        "input_condition": torch.linalg.cond(terms.A),
+    }
+    return pd.DataFrame({name: value.cpu().numpy() for name, value in columns.items()})
 
 
 def _inverse(matrix: Tensor) -> Tensor:

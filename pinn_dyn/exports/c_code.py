@@ -356,6 +356,13 @@ class CFunction:
         pointers = [f"&{self._element(value, ['0'])}" for value in values]
         self.lines.append(f"{name}({', '.join([*self.constants.arguments, *pointers])});")
 
+    def _iterate(self, node: fx.Node, name: str, start: fx.Node, rows: fx.Node) -> None:
+        x, (count, size) = self._declare(node), rows.meta["val"].shape
+        self._assign(x, start)
+        state, row = (f"&{self._element(y, ['0'] * y.ndim)}" for y in (x, rows.meta["val"]))
+        arguments = [*self.constants.arguments, state, f"{row} + {size} * k", state]
+        self.lines.append(f"for (int k = 0; k < {count}; k++) {name}({', '.join(arguments)});")
+
     def _reduction(self, node: fx.Node, source: fx.Node, dims: Any = None, keep: bool = False):
         start, step = REDUCTIONS[operation(node)]
         start = self.constants.spread(start)

@@ -47,22 +47,18 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     """
     name = identifier(path.stem)
     constants = ConstantArrays(real)
-    called: dict[str, tuple[Program, CBody]] = {}
-    programs, bodies = [], []
+    parts: dict[str, tuple[Program, CBody]] = {}
+    programs, bodies, calls = [], [], []
     for function in functions:
-        parts = function.programs()
-        programs.append(parts.pop(function.name))
+        inner = function.programs()
+        calls.append(len(inner) > 1)
+        programs.append(inner.pop(function.name))
         bodies.append(c_function(programs[-1], constants))
-        called |= {x: (p, c_function(p, constants)) for x, p in parts.items()}
-    code = [f"typedef {real} real;", PRELUDE, *constants.definitions()]
-    for inner, (program, body) in called.items():
-        names = [*(f"const real *{x}" for x in program.inputs), "real *result"]
-        unused = [f"(void){x};" for x in program.inputs]
-        code += [f"\nstatic void {inner}({', '.join(names)})"]
-        code += ["{", *(f"  {line}" for line in [*unused, *body.lines]), "}"]
-    declarations, deepest = [], max((body.stack for _, body in called.values()), default=0)
-    for function, program, body in zip(functions, programs, bodies, strict=True):
-        stack = body.stack + deepest * function.calls
+        parts |= {x: (p, c_function(p, constants)) for x, p in inner.items()}
+    code = [f"typedef {real} real;", PRELUDE, *constants.definitions(), *static_functions(parts)]
+    declarations, deepest = [], max((body.stack for _, body in parts.values()), default=0)
+    for function, program, body, has_calls in zip(functions, programs, bodies, calls, strict=True):
+        stack = body.stack + deepest * has_calls
         signature = _signature(function.name, program, name, real)
         declarations += [
             f"/* {function.about} Stack: at most {stack} bytes. */".replace("/*  ", "/* "),
@@ -102,6 +98,22 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     if compiled is None:
         return {}
     return {x: _call(compiled, x, program, real) for x, program in named.items()}
+
+
+def static_functions(
+    parts: Mapping[str, tuple[Program, CBody]], arguments: Sequence[str] = ()
+) -> list[str]:
+    """Return the lines of functions that other functions of a file call, by name.
+
+    ``arguments`` are declarations of further arguments.
+    """
+    code = []
+    for name, (program, body) in parts.items():
+        names = [*arguments, *(f"const real *{x}" for x in program.inputs), "real *result"]
+        unused = [f"(void){x};" for x in program.inputs]
+        code += [f"\nstatic void {name}({', '.join(names)})"]
+        code += ["{", *(f"  {line}" for line in [*unused, *body.lines]), "}"]
+    return code
 
 
 def _signature(function: str, program: Program, name: str, real: Real) -> str:

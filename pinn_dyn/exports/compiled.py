@@ -17,10 +17,11 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.exports.c_code import PRELUDE
-from pinn_dyn.exports.c_file import find_compiler
+from pinn_dyn.exports.c_file import find_compiler, static_functions
 from pinn_dyn.exports.c_library import QUICK, load_code, recall, remember
 from pinn_dyn.exports.live_numbers import LiveNumbers
-from pinn_dyn.exports.program import Constants, Program, trace
+from pinn_dyn.exports.program import Constants, Program
+from pinn_dyn.exports.repeated import programs
 from pinn_dyn.exports.scalar_code import c_function
 from pinn_dyn.exports.watch import Watch
 
@@ -287,15 +288,17 @@ class _Rows(Kind):
         self.name, self._function, self._rows = name, function, rows.reshape(-1, rows.shape[-1])
 
     def programs(self) -> dict[str, Program]:
-        return {"row": trace(self._function, {"x": self._rows[0]}, ["y"])}
+        return programs("row", self._function, {"x": self._rows[0]}, ["y"])
 
     def text(self, programs: dict[str, Program], numbers: LiveNumbers) -> str:
-        program = programs["row"]
+        *parts, (_, program) = programs.items()
         n, m = program.inputs["x"].numel(), program.outputs["y"].numel()
+        bodies = {name: (part, c_function(part, numbers)) for name, part in parts}
         lines = c_function(program, numbers).lines
         return _ROWS.format(
             prelude=PRELUDE,
             definitions="\n".join(numbers.definitions()),
+            parts="\n".join(static_functions(bodies, ["const double *values"])),
             lines="\n".join(lines),
             n=n,
             m=m,
@@ -327,6 +330,7 @@ typedef double real;
 {prelude}
 #define VALUES values
 {definitions}
+{parts}
 static void row(const double *values, const real *restrict x, real *restrict y)
 {{
 {lines}

@@ -68,7 +68,7 @@ class ExportedFunction:
         model: ContinuousPredictor | None = None,
     ):
         self.name, self.function, self.about = name, function, about
-        self._model, self.calls = model, model is not None
+        self._model = model
         self.inputs, self.outputs = dict(inputs), list(outputs)
 
     @cached_property
@@ -80,13 +80,14 @@ class ExportedFunction:
         return trace(self.function, example, self.outputs)
 
     def programs(self) -> dict[str, Program]:
-        """Return the operations by name, first those of the part of the model that it calls."""
+        """Return the operations by name, first those of the parts that it calls."""
         from pinn_dyn.exports.program import calling_part, trace
+        from pinn_dyn.exports.repeated import programs
 
-        if self._model is None:
-            return {self.name: self.program}
-        n, m = self._model.num_coordinates, self._model.num_inputs
         example = {name: values[0] for name, values in self.inputs.items()}
+        if self._model is None:
+            return programs(self.name, self.function, example, self.outputs)
+        n, m = self._model.num_coordinates, self._model.num_inputs
         state, u = torch.zeros(2 * n + m).double().split([2 * n, m])
         calling, part = calling_part(self._model, state, u)
         function = partial(self.function, model=calling)

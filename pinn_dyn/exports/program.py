@@ -7,6 +7,7 @@ import copy
 import operator
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -167,6 +168,14 @@ def unsupported(node: fx.Node, form: str) -> TypeError:
     )
 
 
+_IS_TRACED: ContextVar[bool] = ContextVar("is_traced", default=False)
+
+
+def is_traced() -> bool:
+    """Return true while :func:`trace` records a function: its operations may not branch."""
+    return _IS_TRACED.get()
+
+
 def trace(
     function: Callable[..., Tensor | tuple[Tensor, ...]],
     inputs: Mapping[str, Tensor],
@@ -192,8 +201,12 @@ def trace(
 
     values = tuple(value.detach().clone() for value in inputs.values())
     recorder = _Recorder(dict(zip(inputs, values, strict=True)))
-    with recorder:
-        results = torch.func.functionalize(run)(*values)
+    token = _IS_TRACED.set(True)
+    try:
+        with recorder:
+            results = torch.func.functionalize(run)(*values)
+    finally:
+        _IS_TRACED.reset(token)
     shapes = {name: value.shape for name, value in zip(outputs, results, strict=True)}
     sizes = {name: value.shape for name, value in inputs.items()}
     module, constants = recorder.finished(results)
@@ -208,7 +221,11 @@ _RULES = {
     x: y for x, y in _RULES.items() if x._schema.name.removeprefix("aten::") not in MOVES.split()
 }
 _RULES |= DECOMPOSITIONS
-_CHECKS = (torch.ops.aten._linalg_check_errors.default, torch.ops.aten.is_same_size.default)
+_CHECKS = (
+    torch.ops.aten._linalg_check_errors.default,
+    torch.ops.aten.is_same_size.default,
+    torch.ops.aten._has_same_storage_numel.default,
+)
 
 
 class _Recorder(TorchDispatchMode):
@@ -369,6 +386,8 @@ if not hasattr(torch.ops.pinn_dyn, "call"):  # a module that is imported again
     _LIBRARY = torch.library.Library("pinn_dyn", "DEF")
     _LIBRARY.define("call(str name, int size, Tensor[] arguments) -> Tensor")
     _LIBRARY.impl("call", _called, "CompositeExplicitAutograd")
+    _LIBRARY.define("iterate(str name, Tensor x, Tensor rows) -> Tensor")
+    _LIBRARY.impl("iterate", lambda name, x, rows: x.clone(), "CompositeExplicitAutograd")
 _call = torch.ops.pinn_dyn.call
 """Operation that stands for a call of a function with one result in a program."""
 

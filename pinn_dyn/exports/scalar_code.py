@@ -207,6 +207,8 @@ class ScalarFunction:
             return self._product(*(self._of[x] for x in arguments))
         if name == "call":
             return self._called(node)
+        if name == "iterate":
+            return self._iterated(node)
         raise unsupported(node, "C code")
 
     def _operand(self, node: fx.Node, k: int) -> np.ndarray | None:
@@ -262,6 +264,14 @@ class ScalarFunction:
         call = self._terms.term("call", function, arguments, size)
         return np.array([self._terms.term("element", call, k) for k in range(size)], dtype=int)
 
+    def _iterated(self, node: fx.Node) -> np.ndarray:
+        given: Any = node.args
+        function, *sources = given
+        arguments = tuple(tuple(self._of[x].ravel().tolist()) for x in sources)
+        loop = self._terms.term("iterate", function, arguments, len(sources[1].meta["val"]))
+        size = len(arguments[0])
+        return np.array([self._terms.term("element", loop, k) for k in range(size)], dtype=int)
+
     # Statements.
 
     def _write_all(self, ends: Sequence[Sequence[Term]], names: Iterable[str]) -> None:
@@ -278,6 +288,8 @@ class ScalarFunction:
                 continue
             if name == "call":
                 self._write_call(term, *rest)
+            elif name == "iterate":
+                self._write_loop(term, *rest)
             else:
                 self._texts[term] = self._written(term, uses[term] > 1, term in results)
         for name, terms in zip(names, ends, strict=True):
@@ -316,12 +328,25 @@ class ScalarFunction:
         self.lines.append(f"{function}({', '.join(names)});")
         self._texts[term] = f"t{term}"
 
+    def _write_loop(
+        self, term: Term, function: str, arguments: Sequence[Sequence[Term]], count: int
+    ) -> None:
+        names = [f"t{term}_{k}" for k in range(len(arguments))]
+        for name, terms in zip(names, arguments, strict=True):
+            values = ", ".join(map(self._value, terms))
+            self.lines.append(f"real {name}[{len(terms)}] = {{{values}}};")
+        x, rows = names
+        row = f"{rows} + {len(arguments[1]) // count} * k"
+        call = f"{function}({', '.join([*self._constants.arguments, x, row, x])})"
+        self.lines.append(f"for (int k = 0; k < {count}; k++) {call};")
+        self._texts[term] = x
+
     def _value(self, term: Term) -> str:
         return self._constants.spread(self._texts[term])
 
 
 _VARIABLE = re.compile(r"\bt\d+(?:_\d+)?\b")
-_ARRAY = re.compile(r"real \w+\[(\d+)\];")
+_ARRAY = re.compile(r"real \w+\[(\d+)\]")
 _MASKS = {"gt", "ge", "lt", "le", "eq", "logical_and", "logical_or", "logical_not"}
 
 
@@ -331,7 +356,7 @@ def _operands(entry: tuple[Any, ...]) -> Sequence[Term]:
         return ()
     if name == "element":
         return rest[:1]
-    return [*itertools.chain(*rest[1])] if name == "call" else rest
+    return [*itertools.chain(*rest[1])] if name in ("call", "iterate") else rest
 
 
 def _most_live(lines: Sequence[str]) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar, final
 
 import torch
+from numpy.typing import ArrayLike
 from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
@@ -30,6 +31,7 @@ class Predictor(nn.Module, abc.ABC):
         past_steps: number n of earlier q that the model uses, a step apart, the latest first. x0
             ``(*batch, 2N + nN)`` holds them after the state; without them the robot was at rest.
         labels, input_labels: name and unit of each coordinate and input, for files, if known.
+        dead_time: time after which inputs of the robot act, one or M, s, for control laws.
     """
 
     fixed_step: float | None = None
@@ -38,6 +40,7 @@ class Predictor(nn.Module, abc.ABC):
     past_steps: int = 0
     labels: Sequence[str] = ()
     input_labels: Sequence[str] = ()
+    dead_time: ArrayLike = 0.0
 
     def __init__(
         self, num_coordinates: PositiveInt, num_inputs: NonNegativeInt, state: State = "qv"

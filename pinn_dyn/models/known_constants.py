@@ -209,10 +209,11 @@ class PhysicalBodies(Constants):
         return root @ root.mT
 
     def parameters_of(self, inertia: Tensor) -> Tensor:
-        """Return the z of pseudo-inertias of positive density, ``(*batch, n, 10)``."""
+        """Return the z of pseudo-inertias of positive density, ``(*batch, n, 10)``; else NaN."""
         whitened = torch.linalg.solve(self.root, torch.linalg.solve(self.root, inertia).mT)
         # An upper Cholesky factor is a lower one of the matrix with its rows and columns reversed.
-        stretch = torch.linalg.cholesky(whitened.flip(-2, -1)).flip(-2, -1)
+        factor, failed = torch.linalg.cholesky_ex(whitened.flip(-2, -1))
+        stretch = torch.where(failed[..., None, None] == 0, factor, torch.nan).flip(-2, -1)
         scale = stretch[..., 3, 3]
         unit = stretch / scale[..., None, None]
         sizes = unit.diagonal(dim1=-2, dim2=-1)[..., :3].log()

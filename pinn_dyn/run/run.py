@@ -254,11 +254,11 @@ class Run:
     ) -> ExternalTorque:
         """Find torques that neither drives nor model explain, and contacts, along a data frame.
 
-        The momentum observer (:class:`~pinn_dyn.control.DisturbanceObserver`) gives the external
-        torque of each joint through a low-pass of 1 / bandwidth s: after this time it has reached
-        63 %, and after three times 95 % of a step. Joints at rest show only what their dry friction
-        cannot hold. The frame has the columns and units of the log, and is cleaned by the same
-        steps.
+        The momentum observer (:class:`~pinn_dyn.control.observer.MomentumObserver`) gives the
+        external torque of each joint through a low-pass of 1 / bandwidth s: after this time it has
+        reached 63 %, and after three times 95 % of a step. Joints at rest show only what their dry
+        friction cannot hold. The frame has the columns and units of the log, and is cleaned by the
+        same steps.
 
         Args:
             frame: the log.
@@ -462,6 +462,7 @@ class Run:
         labels = self.labels, self.input_labels
         if (self.model.labels, self.model.input_labels) != labels:
             self.model.labels, self.model.input_labels = labels
+            self.model.dead_time = self.input_delay
         return self.model
 
     def terms(self, q: Values) -> TermArrays:

@@ -8,6 +8,7 @@ import difflib
 import functools
 import inspect
 import pkgutil
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
@@ -83,15 +84,26 @@ def _reported(value: Any, path: str = "") -> Iterator[None]:
         raise ConfigError("\n".join(dict.fromkeys(lines))) from error
 
 
+_CHANGED = {
+    "delay": ": it is now dead_time in s",
+    "rate": "; a law in nearly continuous time is rate=20000",
+    "stability": ": python examples/paper/proposition_1.py RUN writes the report",
+    r"controllers\.\w+\.(law|observer)\.actuator": ": the limits of the loop are enough, remove it",
+}
+"""Hints for keys of earlier versions."""
+
+
 def _line(mistake: Mapping[str, Any], root: Any, path: str) -> str:
     for step in mistake["loc"]:
         path += f"[{step}]" if isinstance(step, int) else f".{step}" if path else str(step)
     kind, value = mistake["type"], mistake["input"]
     if kind == "missing" or value == "???":
         return f"no value for {path}: give it as '{path}=...'"
+    change = next((text for pattern, text in _CHANGED.items() if re.fullmatch(pattern, path)), "")
     if kind == "unknown_key":
-        return f"the configuration has no key '{path}'{_closest(path, mistake['ctx'], root)}"
-    expected = mistake["msg"].replace("Input should be", "expected")
+        hint = change or _closest(path, mistake["ctx"], root)
+        return f"the configuration has no key '{path}'{hint}"
+    expected = mistake["msg"].replace("Input should be", "expected") + change
     if kind == "object" and isinstance(value, str) and "." in path:
         expected += f"; to choose the option of a group, write {path.replace('.', '/')}={value}"
     text = repr(value)

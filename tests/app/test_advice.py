@@ -27,7 +27,6 @@ SHORT = ["steps=2", "duration=3"]
 ROBOT = f"model.structure.urdf={PENDULUM}"
 STEP = ["duration=0.05", "settled_after=0.03", "animate=false", "rate=200"]
 LOOP = ["run={lnn}", *SET_POINTS, "~controllers.truth", "~controllers.pd", "runs=1"]
-CONTINUOUS = [*LOOP, "rate=null", "controllers.learned.terms=truth"]
 COMMANDS = {
     "no momenta": ["train.py", *LOG, "model=hnn", "model.state=qp"],
     "midpoint, no derivative": ["train.py", *TINY, "model=mlp", "loss=midpoint"],
@@ -62,9 +61,6 @@ COMMANDS = {
     "no run": ["control.py", *SET_POINTS, "rate=200"],
     "no set point": ["control.py", "run={lnn}", *STEP],
     "control of a black box": ["control.py", "run={mlp}", *SET_POINTS, "rate=200"],
-    "rate of an actuator": ["control.py", *CONTINUOUS, "actuator.rate=1.0"],
-    "delay in continuous time": ["control.py", *CONTINUOUS, "delay=1"],
-    "noise in continuous time": ["control.py", *CONTINUOUS, "sensor.v_noise=0.1"],
     "gains that let the loop diverge": [
         *("control.py", *LOOP, "rate=100"),
         *("gains.position=2e4", "gains.velocity=300", "controllers.learned.terms=truth"),

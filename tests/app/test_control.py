@@ -1,6 +1,7 @@
 """control.py: what it writes, and what it refuses."""
 
 import json
+import re
 import sys
 from types import SimpleNamespace
 
@@ -17,8 +18,6 @@ from pinn_dyn.control import Tracking, export_law
 from pinn_dyn.exports.escaping import c_text
 from pinn_dyn.systems import RigidChain
 from tests.app.entry import (
-    HIGH,
-    LOW,
     NO_FIGURES,
     SET_POINTS,
     STRIDE,
@@ -88,7 +87,7 @@ def test_figures_record_page_and_provenance_are_written(results, lnn_run):
 
 
 def test_limits_noise_delay_and_another_mass_reach_the_loop(tmp_path, results, lnn_run, undrawn):
-    effects = ["actuator.low=-1.2", "actuator.high=0.1", "delay=2", "sensor.q_noise=0.01"]
+    effects = ["actuator.low=-1.2", "actuator.high=0.1", "dead_time=0.01", "sensor.q_noise=0.01"]
     effects += ["+robot.mass=0.36"]
     folder = control(tmp_path, lnn_run, "rate=200", *effects)
     with np.load(folder / "record_learned.npz") as record:
@@ -127,18 +126,6 @@ def test_a_run_that_was_stopped_at_once_has_its_curves_and_its_report(tmp_path, 
     assert "the plant diverged" in (folder / "report.html").read_text()
 
 
-def test_the_stability_report_has_the_conditions_and_every_set_point(tmp_path, lnn_run, undrawn):
-    box = f"stability={{region: a small box, q_low: {LOW}, q_high: {HIGH}, samples: 20}}"
-    folder = control(tmp_path, lnn_run, "rate=200", box, "~controllers.pd", "~controllers.truth")
-    text = (folder / "stability.md").read_text()
-    assert "over a small box" in text
-    assert "Proposition 1" in text
-    assert len(pd.read_csv(folder / "stability_region.csv")) == 20
-    points = pd.read_csv(folder / "stability_set_points.csv")
-    assert len(points) == 3
-    assert {"bound", "error", "measured_error", "holds"} <= set(points)
-
-
 def test_the_learned_law_is_exported_with_its_limits_and_guard(
     tmp_path, lnn_run, undrawn, few_states
 ):
@@ -150,13 +137,13 @@ def test_the_learned_law_is_exported_with_its_limits_and_guard(
     control_law = function_of(path, "law_control")
     size = pinn_dyn.load(lnn_run).model.num_coordinates
     far = np.full(size, 50.0)
-    u, memory, status = control_law(far, far, far, far, far, np.full(size, 0.2))
+    u, memory, status = control_law(far, far, far, far, far, [1.0, *[0.2] * size])
     np.testing.assert_allclose(u, 0.2)
-    np.testing.assert_allclose(memory, 0.2)
+    np.testing.assert_allclose(memory, [1.0, *[0.2] * size])
     assert status == 2
     header = path.with_suffix(".h").read_text()
     for part in (
-        f"#define law_MEMORY_SIZE {size}",
+        f"#define law_MEMORY_SIZE {1 + size}",
         c_text('"period": 0.005'),
         c_text('"fallback": "hold"'),
     ):
@@ -183,7 +170,9 @@ def test_the_guard_acts_and_is_exported_with_the_observer(tmp_path, lnn_run, und
     control(tmp_path / "out", lnn_run, *words)
     size = pinn_dyn.load(lnn_run).model.num_coordinates
     far = np.full(size, 50.0)
-    memory = np.concatenate([np.full(size, 0.2), np.zeros(1 + 3 * size)])
+    header = path.with_suffix(".h").read_text()
+    memory = np.zeros(int(re.search(r"MEMORY_SIZE (\d+)", header)[1]))
+    memory[: 1 + size] = [1.0, *[0.2] * size]
     u, _, status = function_of(path, "law_control")(far, far, far, far, far, memory)
     np.testing.assert_allclose(u, 0.2)
     assert status == 2
@@ -219,11 +208,10 @@ def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
         (["gains.position=[1,2]"], ["controllers.learned", "position_gain"]),
         (["reference.q_low=[0,0]", "reference.q_high=[0,0]"], ["reference"]),
         (["controllers.learned.terms=guess"], ["controllers.learned.terms", "guess", "truth"]),
-        (["delay=-1"], ["delay", "-1"]),
+        (["dead_time=-1"], ["dead_time", "-1"]),
+        (["delay=2"], ["delay", "dead_time in s"]),
         (["+robot.mass=-1"], ["robot", "mass", "-1"]),
-        (["rate=null", "actuator.rate=1.0"], ["rate"]),
-        (["rate=null", "delay=1"], ["delay", "rate"]),
-        (["rate=null", "sensor.v_noise=0.1"], ["sensor", "rate"]),
+        (["rate=null"], ["rate", "20000"]),
         (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
         (["member=1"], ["member is 1", "a single model"]),
         (["checkpoint=first"], ["first", "'best' or 'last'"]),
@@ -263,8 +251,6 @@ def test_oscillators_control_beside_pid_and_the_true_terms(
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["guard.threshold=1"], "guard: a law on oscillators has no guard"),
-        (["stability={region: r, q_low: [0,0,0], q_high: [1,1,1], samples: 5}"], "stability"),
         (["controllers=regulation"], "CoupledOscillators"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,

@@ -124,7 +124,7 @@ def control_law(run):
     q, v, other = np.array([0.1, -0.2, 0.2]), np.array([0.5, -1.0, 2.0]), np.ones(3)
     _, _, G, A = pinn_dyn.load(run).terms(q)
     u, *_ = function_of(Path("law.c").absolute(), "law_control")(
-        q, v, other, other, other, np.zeros(3)
+        q, v, other, other, other, np.zeros(4)
     )
     np.testing.assert_allclose(u, np.linalg.solve(A, G) - 0.5 * A.T @ v, rtol=1e-8)
 

@@ -76,13 +76,11 @@ MISTAKES = {
         plant={_target_: pinn_dyn.control.SystemPlant, _partial_: true, system: 3}
         guard.threshold=-1
         guard.fallback=stop
-        stability={region: a}
-        stability={region: a, q_low: [x], q_high: [1], samples: 5}
         member=-1
         duration=0
         actuator.low=x
         actuator.lowest=1
-        delay=-1
+        dead_time=-1
     """,
     "gather": "evaluations=[1]",
     "excite": """

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.control import AdaptiveTracking, Motion, Sines, export_law
+from pinn_dyn.control import Actuator, AdaptiveTracking, Motion, Pipeline, Sines
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.systems import RigidChain, SoftArm
 from pinn_dyn.testing import ControllerContract
-from tests.support.c_code import function_of
+from pinn_dyn.testing.controller import input_of
 from tests.support.known import statistics
 from tests.support.rigid_chains import TREE
 
@@ -45,9 +45,11 @@ def advanced(plant, q, v, u):
 
 
 def follow(law, plant, seconds, start=0.0, state=None, noise=(0.0, 0.0)):
-    """q, v, memory and goal of a loop that goes on with the memory of the law, and its end."""
+    """q, v, constants and goal of a loop that goes on with a state and a memory, and its end."""
     motion, generator = REFERENCE(start), torch.Generator().manual_seed(round(start))
-    q, v = state or (motion.q[None].clone(), motion.v[None].clone())
+    pipeline = Pipeline(law, PERIOD)
+    memory = torch.zeros(1, pipeline.memory_size).double()
+    q, v, memory = state or (motion.q[None].clone(), motion.v[None].clone(), memory)
     rows = []
     for k in range(round(seconds / PERIOD)):
         t = start + k * PERIOD
@@ -56,11 +58,17 @@ def follow(law, plant, seconds, start=0.0, state=None, noise=(0.0, 0.0)):
             x + y * torch.randn(x.shape, generator=generator)
             for x, y in zip((q, v), noise, strict=True)
         ]
-        u = law(t, *measured, Motion(*(x[None] for x in motion)))
-        rows.append((q[0], v[0], law.memory[0].clone(), motion.q))
+        u, _, memory = pipeline(*measured, *(x[None] for x in motion), memory)
+        rows.append((q[0], v[0], constants_of(law, memory)[0], motion.q))
         with torch.no_grad():
             q, v = advanced(plant, q, v, u)
-    return [torch.stack(x) for x in zip(*rows, strict=True)], (q, v)
+    return [torch.stack(x) for x in zip(*rows, strict=True)], (q, v, memory)
+
+
+def constants_of(law, memory):
+    """The constants of the latest call, after the mark and the last input."""
+    start = 1 + law.num_inputs
+    return memory[..., start : start + law.constants_size]
 
 
 def errors(columns):
@@ -82,7 +90,7 @@ def picked_up():
             law = AdaptiveTracking(loaded(), *GAINS, rate=rate, adapt=["payload"])
         after, _ = follow(law, loaded(), 4.0, 1.0, state, noise=NOISE)
         results[name] = np.concatenate([errors(before), errors(after)])
-        results[f"mass {name}"] = float(law.diagnostics()["adapted_mass"][0])
+        results[f"mass {name}"] = float(law._inertia(after[2][-1])[3, 3])
     return results
 
 
@@ -170,33 +178,77 @@ def test_constants_of_the_model_give_the_law_of_slotine_and_li():
     law = AdaptiveTracking(model, 3.0, 2.0)
     generator = torch.Generator().manual_seed(0)
     q, v, a = torch.randn(3, 5, 4, generator=generator).double()
-    u = law(0.0, q, v, Motion(q, v, a))
+    u = input_of(law, q, v, Motion(q, v, a))
     torch.testing.assert_close(u, model.input_for(q, v, a))
     # Velocities ahead of the reference: C(q, v) w from the Christoffel symbols.
     ahead = Motion(q, v + 1.0, a)
     expected = model.inverse_dynamics(q, 0 * v, a + 3.0) - model.dissipative_force(q, 0 * v)
     expected += (model.coriolis_matrix(q, v) @ (v + 1.0)[..., None])[..., 0]
     expected += model.dissipative_force(q, v + 1.0) + 2.0
-    torch.testing.assert_close(model.input_matrix(q[0]) @ law(0.0, q, v, ahead)[0], expected[0])
+    torch.testing.assert_close(
+        model.input_matrix(q[0]) @ input_of(law, q, v, ahead)[0], expected[0]
+    )
 
 
-def test_the_file_in_c_adapts_as_the_loop(tmp_path):
-    model = identified()
+def test_the_payload_adapts_along_the_gradient_of_the_power():
+    """dJ/dt = g J S J with tr(S X) = s^T Y(X), of the slope of the torque with the inertia."""
+    law = AdaptiveTracking(pendulum(), *GAINS, rate=3.0, adapt=["payload"])
+    generator = torch.Generator().manual_seed(0)
+    q, v, q_ref, v_ref, a_ref = torch.randn(5, 2, generator=generator).double()
+    constants = 0.3 * torch.randn(10, generator=generator).double()
+    J, motion = law._inertia(constants), Motion(q_ref, v_ref, a_ref)
+    s = v_ref + GAINS[0] * (q_ref - q) - v
+
+    def power(inertia):
+        arm = pendulum()
+        arm.inertia[1] = inertia
+        other = AdaptiveTracking(arm, *GAINS, adapt=["payload"])
+        return s @ other._torque(q, v, motion, torch.zeros(10).double())
+
+    # tr(S X) for a basis of the symmetric X, by differences of a linear function.
+    S = torch.zeros(4, 4).double()
+    for i in range(4):
+        for j in range(i + 1):
+            X = torch.zeros(4, 4).double()
+            X[i, j] = X[j, i] = 1e-6
+            slope = (power(J + X) - power(J)) / 1e-6
+            S[i, j] = S[j, i] = slope / (1 if i == j else 2)
+    B = torch.linalg.cholesky(J)
+    found = law.changes(q, v, motion, constants, 0 * q).unflatten(-1, (4, 4))
+    torch.testing.assert_close(found, 3.0 * B.T @ S @ B, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(found, found.T)
+
+
+def test_no_constant_moves_far_in_a_period():
     parts = ["payload", "friction", "offset"]
-    law = AdaptiveTracking(model, 5.0, 2.0, rate=0.5, adapt=parts)
-    path = export_law(law, tmp_path / "law.c", period=0.01)
-    call = function_of(path, "law_control")
-    law = AdaptiveTracking(model, 5.0, 2.0, rate=0.5, adapt=parts)
-    memory = np.zeros(model.num_inputs + law.memory_size)
-    for k in range(40):
-        t = 0.01 * k
-        q, v = (torch.tensor([np.sin(t * w + w) for w in range(1, 5)]).double() for _ in range(2))
-        goal = Motion(q + 0.1, v, 0 * q)
-        expected = law(t, q, v, goal)
-        u, memory, status = call(*(x.numpy() for x in (q, v, *goal)), memory)
-        np.testing.assert_allclose(u, expected, rtol=1e-8)
-        assert status == 0
-    assert np.abs(memory[model.num_inputs :]).max() > 0.01
+    law = AdaptiveTracking(pendulum(), *GAINS, rate=1.0, adapt=parts, offset=2.0)
+    before = torch.zeros(law.constants_size).double()
+    after = law.adapted(before, torch.full((20,), 1e6).double(), PERIOD)
+    assert after[10:].tolist() == [0.5] * 4
+    X = torch.full((4, 4), 0.125).double()  # of norm 1/2
+    one, B = torch.eye(4).double(), torch.linalg.cholesky(law._inertia(before))
+    expected = B @ torch.linalg.solve(one - X / 2, one + X / 2) @ B.T
+    torch.testing.assert_close(law._inertia(after), expected, rtol=1e-4, atol=1e-8)
+
+
+def test_limits_of_the_input_are_not_taken_for_a_payload():
+    """With an exact model, constants do not move by more than C, which sigma leaves out."""
+    arm, moved = pendulum(), {}
+    law = AdaptiveTracking(arm, *GAINS, rate=20.0)
+    for name in ("sigma", "without"):
+        actuator = Actuator(low=-1.5, high=1.5)
+        pipeline = Pipeline(law, PERIOD, actuator=actuator)
+        q, v = (x[None] for x in REFERENCE(0.0)[:2])
+        memory, statuses = torch.zeros(1, pipeline.memory_size).double(), 0
+        for k in range(100):
+            u, status, memory = pipeline(q, v, *REFERENCE(k * PERIOD), memory)
+            statuses += int(status)
+            if name == "without":  # as if the wanted input had been applied
+                memory[..., -2:] = u
+            q, v = advanced(arm, q, v, u)
+        assert statuses > 20
+        moved[name] = float(constants_of(law, memory).abs().max())
+    assert moved["sigma"] < 0.2 * moved["without"]
 
 
 def test_models_without_bodies_are_refused():

@@ -6,16 +6,16 @@ import torch
 
 from pinn_dyn.control import (
     Actuator,
-    DelayCompensation,
     DisturbanceObserver,
+    Pipeline,
     PredictiveControl,
     Sines,
     Tracking,
     close_loop,
-    export_law,
 )
 from pinn_dyn.control.contracts import Plant
-from tests.support.c_code import function_of
+from pinn_dyn.control.dead_time import DeadTime
+from tests.support.closed_loops import PD
 from tests.support.linear import Pendulums
 
 RATE, PIECES = 100.0, 10
@@ -103,40 +103,38 @@ def test_dead_time_costs_less_than_a_third_of_the_tracking_error(model, make, de
     if make is predictive:
         pytest.importorskip("casadi")
     expected = tracking_error(make(model))
-    law = DelayCompensation(make(model), model, delays, 1 / RATE)
+    law = Pipeline(make(model), 1 / RATE, dead_time=delays)
     assert tracking_error(law, delays) < 1.3 * expected
     if make is tracking:
         assert tracking_error(make(model), delays) > 2 * expected
 
 
-def test_the_file_gives_the_inputs_of_the_loop(model, tmp_path, few_states):
-    """Dead times of 2.6 and 1 samples, an observer, and limits that act."""
-    limits = dict(low=-2.0, high=8.0, rate=300.0)
-    inner = DisturbanceObserver(tracking(model), 20.0, actuator=Actuator(**limits))
-    law = DelayCompensation(inner, model, [0.026, 0.01], 1 / RATE, Actuator(**limits))
-    path = export_law(law, tmp_path / "law.c", actuator=Actuator(**limits))
-    call, memory = function_of(path, "law_control"), np.zeros(3 * 2 + 7)
-    limited = Actuator(**limits)
-    statuses = set()
-    for k in range(40):
-        q, v, _ = REFERENCE(k / RATE)
-        reference = REFERENCE(k / RATE + law.ahead)
-        expected, _ = limited(law(k / RATE, 0.9 * q, v, reference), 1 / RATE)
-        u, memory, status = call(0.9 * q, v, *reference, memory)
-        np.testing.assert_allclose(u, expected, rtol=1e-9, atol=1e-12)
-        statuses.add(status)
-    assert statuses == {0, 1}
-
-
 def test_the_loop_delays_by_parts_of_a_period(model):
     limits = dict(low=-1.0, high=3.0, rate=100.0)
     late = closed(tracking(model), (0.016, 0.016), actuator=Actuator(**limits))
-    loop = closed(tracking(model), delay=1.6, actuator=Actuator(**limits))
+    loop = closed(tracking(model), dead_time=0.016, actuator=Actuator(**limits))
     np.testing.assert_allclose(loop.q, late.q, atol=1e-5)
     assert np.abs(loop.q - closed(tracking(model)).q).max() > 1e-3
 
 
-def test_another_period_than_that_of_the_loop_is_refused(model):
-    law = DelayCompensation(tracking(model), model, 0.02, 2 / RATE)
-    with pytest.raises(ValueError, match=r"0.01 s after 0 s, expected steps of the period 0.02 s"):
-        closed(law)
+def test_the_prediction_takes_the_inputs_that_act_within_the_dead_time(model):
+    """By many small steps: 2.6 and 1 periods, of which the older input acts for 0.6 periods."""
+    late = DeadTime(model, [0.026, 0.01], 1 / RATE)
+    assert (late.ahead, late.size) == (0.026, 3)
+    q, v = torch.tensor([0.3, -0.2]).double(), torch.tensor([1.0, 0.5]).double()
+    past = torch.tensor([[3.0, -1.0], [-2.0, 2.0], [1.0, 4.0]]).double()
+    x = np.concatenate([q, v])[None]
+    for u, periods in zip(past.numpy(), (0.6, 1.0, 1.0), strict=True):
+        h = periods / RATE / 1000
+        for _ in range(1000):
+            x = x + h * LatePendulums.slope(x, u)
+    found = torch.cat(late.predict(q, v, past)).numpy()
+    np.testing.assert_allclose(found, x[0], atol=2e-4)
+    # The second input waits 1.6 periods longer than it must: between the last and the one before.
+    new = torch.cat([past, torch.tensor([[7.0, -3.0]]).double()])
+    assert late.held_back(new).tolist() == pytest.approx([7.0, 0.6 * 2.0 + 0.4 * 4.0])
+
+
+def test_a_law_without_a_model_cannot_compensate_a_dead_time():
+    with pytest.raises(ValueError, match="PD has no model that predicts over the dead time"):
+        Pipeline(PD(), 0.01, dead_time=0.02)

@@ -9,20 +9,15 @@ import torch
 from pinn_dyn.control import (
     Actuator,
     LatentLaw,
-    LatentPlan,
     MotorPID,
+    Pipeline,
     SetPoint,
     close_loop,
-    export_law,
 )
 from pinn_dyn.control.contracts import Motion, Plant, Reference
-from pinn_dyn.control.latent_plan import LatentMechanics
-from pinn_dyn.control.safe_law import SafeLaw
 from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.testing import LinearSystem, damped_oscillators
 from tests.models.builders import STEP, make_statistics
-from tests.support.c_code import function_of
-from tests.support.code_in_c import build_at_once, codes
 
 
 def make_oscillators(output):
@@ -81,8 +76,8 @@ class SetPoints(Reference):
         return Motion(self.q, 0 * self.q, 0 * self.q)
 
 
-def errors(model, law, *, delay=0.0, rate=1 / STEP, actuator=None):
-    """Return |q - q_ref| over time for two set points that the plant can hold, ``(2, T)``."""
+def closed(model, law, *, dead_time=0.0, rate=1 / STEP, actuator=None):
+    """Return a loop to two set points that the plant can hold, and the lengths of the steps."""
     plant = Oscillators(model)
     u = model.mean[-2:] + model.std[-2:] * torch.tensor([[0.5, -0.3], [-0.4, 0.6]]).double()
     targets = plant.model.rest(u)[1]
@@ -95,11 +90,17 @@ def errors(model, law, *, delay=0.0, rate=1 / STEP, actuator=None):
         0 * start,
         duration=150 / rate,
         rate=rate,
-        delay=delay,
+        dead_time=dead_time,
         actuator=actuator,
     )
     assert record.stopped == [None, None]
-    return (record.q - targets[:, None]).norm(dim=-1), (targets - start).norm(dim=-1)
+    return record, (targets - start).norm(dim=-1)
+
+
+def errors(*arguments, **settings):
+    """Return |q - q_ref| over time, ``(2, T)``, and the lengths of the steps."""
+    record, steps = closed(*arguments, **settings)
+    return (record.q - record.reference.q).norm(dim=-1), steps
 
 
 @pytest.mark.parametrize("periods", [0.0, 1.0, 2.5])
@@ -108,10 +109,10 @@ def test_the_steady_state_error_vanishes_with_a_wrong_model(model, periods, shar
     """Rates of one and two calls per step of the model, with dead times."""
     period = share * STEP
     law = LatentLaw(model, 0.5, 0.5 * STEP, 0.2 / STEP, dead_time=periods * period, noise=0.01)
-    found, steps = errors(model, law, delay=periods, rate=1 / period)
+    found, steps = errors(model, law, dead_time=periods * period, rate=1 / period)
     assert (found[:, -1] < 1e-3 * steps).all()
-    disturbance = law._memory[:, 1 + 2 * len(model.bias) :][:, :2]
-    assert disturbance.norm() > 0.01 * steps.min()  # the model was wrong
+    short, _ = errors(model, LatentLaw(model, 0.5, 0.5 * STEP, 1e-6), rate=1 / period)
+    assert (short[:, -1] > 0.01 * steps).any()  # the model is wrong
 
 
 def test_the_steady_state_error_vanishes_in_measured_coordinates():
@@ -132,8 +133,8 @@ def test_no_gain_and_no_rate_is_too_large_for_the_model(model, gain, share):
     F = at.input * model.std[-2:]
     compliant = torch.linalg.solve(at.stiffness, F)
     spring = gain * F @ torch.linalg.solve(F.T @ compliant, F.T)
-    law.prepare(share * STEP)
-    known = torch.ones(1, 1).bool(), F, compliant, at.z, torch.zeros(1, n).double(), u[None]
+    law = Pipeline(law, share * STEP).law
+    known = F, compliant, at.z, torch.zeros(1, n).double(), u[None]
     x = 1e-5 * torch.randn(1, 2 * n, generator=torch.manual_seed(0)).double()
     rest = torch.cat([at.z, torch.zeros_like(at.z)])
     energies = []
@@ -196,18 +197,11 @@ def test_the_law_keeps_the_limits_without_winding_up(model):
     """Limits that cut the transient, not the steady state."""
     largest = (model.mean[-2:] + torch.tensor([0.51, 0.61]) * model.std[-2:]).tolist()
     lowest = (model.mean[-2:] - torch.tensor([0.41, 0.31]) * model.std[-2:]).tolist()
-    inputs = []
-
-    class Recorded(LatentLaw):
-        def __call__(self, *arguments):
-            inputs.append(super().__call__(*arguments))
-            return inputs[-1]
-
     actuator = Actuator(low=lowest, high=largest)
-    law = Recorded(model, 1.0, 0.0, 0.2 / STEP, actuator=actuator)
-    found, steps = errors(model, law)
-    assert (found[:, -1] < 1e-3 * steps).all()
-    u = torch.stack(inputs)
+    record, steps = closed(model, LatentLaw(model, 1.0, 0.0, 0.2 / STEP), actuator=actuator)
+    error = (record.q - record.reference.q).norm(dim=-1)
+    assert (error[:, -1] < 1e-3 * steps).all()
+    u = record.u.transpose(0, 1)
     low, high = torch.tensor([lowest, largest]).double()
     at_limits = (u < low + 1e-6) | (u > high - 1e-6)
     assert ((u > low - 1e-6) & (u < high + 1e-6)).all()
@@ -215,64 +209,39 @@ def test_the_law_keeps_the_limits_without_winding_up(model):
     assert not at_limits[-1].any()
 
 
-@pytest.mark.usefixtures("few_states")
-def test_the_file_in_c_gives_the_inputs_of_the_loop(model, tmp_path, monkeypatch):
-    """A closed loop with a wrong model, limits and a dead time; and rows in C in the loop."""
-    low, high = ((model.mean[-2:] + s * model.std[-2:]).tolist() for s in (-0.4, 0.5))
-    build_at_once(monkeypatch, tmp_path)
-    law = LatentLaw(
-        *(model, 0.5, 0.5 * STEP, 0.2 / STEP),
-        dead_time=1.5 * STEP,
-        first_input=[0.1, -0.1],
-        actuator=Actuator(low, high, 2.0 / STEP),
-    )
-    path = export_law(law, tmp_path / "law.c", period=STEP)
-    call, size = function_of(path, "law_control"), SafeLaw(law, None, STEP).memory_size
-    plant, zero = Oscillators(model), torch.zeros(1, 2).double()
-    target = plant.model.rest(model.mean[-2:] + 0.3 * model.std[-2:])[1]
-    q, memory, statuses = plant.model.rest(zero)[1], np.zeros(size), set()
-    plant.start(q, zero)
-    for k in range(40):
-        motion = Motion(target, 0 * target, 0 * target)
-        u = law(k * STEP, q, zero, motion)
-        found, memory, status = call(*(x.numpy() for x in (q[0], zero[0], *motion)), memory)
-        np.testing.assert_allclose(found, u[0], rtol=1e-9, atol=1e-9)
-        statuses.add(status)
-        q, _ = plant.advance(u, STEP)
-    assert statuses == {0, 1}
-    assert len(codes()) == 1
-    u, after, status = call(*(x.numpy() for x in (torch.nan * q[0], zero[0], *motion)), memory)
-    np.testing.assert_array_equal(u, found)
-    np.testing.assert_array_equal(after[-law.memory_size :], memory[-law.memory_size :])
-    assert status == 4
+def test_the_set_point_is_filtered_at_least_at_a_fifth_of_the_rate_of_the_model(model):
+    """dq_s/dt = 0.2 / T (q_ref - q_s), also with a slow integral action."""
+    law = Pipeline(LatentLaw(model, integral_gain=1e-3), STEP).law
+    q, zero = torch.tensor([0.1, -0.2]).double(), torch.zeros(2).double()
+    memory = law.start(q, zero, zero)
+    target = q + torch.tensor([0.3, 0.1]).double()
+    _, after, _ = law.step(q, zero, Motion(target, zero, zero), zero, memory)
+    q_s = after.split(law._sizes)[2]
+    torch.testing.assert_close(q_s, target + np.exp(-0.2) * (q - target))
 
 
-def test_plans_have_no_steady_state_error_and_keep_the_limits(model):
-    pytest.importorskip("casadi")
-    low, high = ((model.mean[-2:] + s * model.std[-2:]).tolist() for s in (-0.41, 0.61))
-    setting = dict(integral_gain=0.2 / STEP, dead_time=STEP, actuator=Actuator(low, high))
-    law = LatentPlan(model, 8 * STEP, **setting)
-    found, steps = errors(model, law, delay=1.0)
-    assert (found[:, -1] < 1e-3 * steps).all()
-    u = torch.from_numpy(np.stack([plan.u for plan in law.planner.plans]))
-    low, high = torch.tensor([low, high])[..., None]
-    assert ((u >= low - 1e-6) & (u <= high + 1e-6)).all()
+def test_a_part_of_a_period_of_dead_time_takes_a_part_of_two_inputs(model):
+    """The state moves by 0.7 of the second last input and 0.3 of the last one."""
+    q, zero = torch.tensor([0.1, -0.2]).double(), torch.zeros(2).double()
+    older, newer = torch.tensor([[0.5, -1.0], [-0.7, 0.4]]).double()
+    law = Pipeline(LatentLaw(model, dead_time=0.7 * STEP), STEP).law
+    memory = law.start(q, zero, older)
+    x, d = memory.split(law._sizes)[:2]
+    moved, _ = law._observed(q, x, d, torch.stack([older, newer]))
+    A, B = model.flow()
+    u = 0.7 * older + 0.3 * newer
+    n = len(model.bias)
+    expected = A @ x + B @ (model.latent_force(u) - model.coupling_force(x[:n]))
+    r = (q - model.observe(expected) - d) / model.std[:2]
+    gain, _ = law.observer_gain(STEP)
+    torch.testing.assert_close(moved, expected + gain[: 2 * n] @ r)
 
 
-def test_a_plan_takes_the_step_of_a_model_without_coupling(model):
-    """The midpoint rule is the step of the model, in seconds."""
-    linear = copy.deepcopy(model)
-    linear.coupling.zero_()
-    x = torch.randn(3, 12, generator=torch.manual_seed(0)).double()
-    u = torch.randn(3, 2).double()
-    A, B = linear.flow()
-    (z, v), (z_later, v_later) = (
-        y.chunk(2, dim=-1) for y in (x, x @ A.mT + linear.latent_force(u) @ B.mT)
-    )
-    middle = (z + z_later) / 2, (v + v_later) / 2 / STEP
-    a = LatentMechanics(linear).forward_dynamics(*middle, u)
-    torch.testing.assert_close(STEP * a, (v_later - v) / STEP)
-    torch.testing.assert_close(STEP * middle[1], z_later - z)
+def test_a_dead_time_of_the_law_is_that_which_is_set(model):
+    law = LatentLaw(model, dead_time=0.06)
+    assert Pipeline(law, 0.01, dead_time=0.02).law._late == 0.06
+    assert Pipeline(LatentLaw(model), 0.01, dead_time=0.02).law._late == 0.02
+    assert Pipeline(LatentLaw(model), 0.01).law._late == 0.0
 
 
 def test_the_law_refuses_other_models():
@@ -289,12 +258,13 @@ def test_pid_of_motors_uses_the_static_gain_of_the_model():
         inputs=[[1.0, 0.5], [-0.5, 2.0]],
     ).requires_grad_(False)
     pid = MotorPID(system, 1.0, 0.0, 2.0)
-    q, zero = torch.tensor([[0.1, -0.2]]).double(), torch.zeros(1, 2).double()
+    q, zero = torch.tensor([0.1, -0.2]).double(), torch.zeros(2).double()
     reference = SetPoint([0.3, 0.1])(0.0)
-    first = pid(0.0, q, zero, reference)
-    second = pid(0.5, q, zero, reference)
+    pipeline = Pipeline(pid, 0.5)
+    first, _, memory = pipeline(q, zero, *reference, torch.zeros(pipeline.memory_size).double())
+    second, _, _ = pipeline(q, zero, *reference, memory)
     typical = system.typical_input(q)
     expected = system.potential_force(q + (reference.q - q)) - system.potential_force(q)
-    applied = system.input_matrix(q) @ (first - typical)[..., None]
-    torch.testing.assert_close(applied[..., 0], expected)
+    applied = system.input_matrix(q) @ (first - typical)
+    torch.testing.assert_close(applied, expected)
     torch.testing.assert_close(second - typical, 2 * (first - typical))

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.control import Motion
+from pinn_dyn.control import Motion, Pipeline
 from pinn_dyn.control.laws import (
     ComputedTorque,
     ProportionalDerivative,
     Regulation,
     Tracking,
+    condition_number,
 )
 from pinn_dyn.mechanics.arrays import pseudo_inverse_times
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
-from pinn_dyn.testing.controller import states
+from pinn_dyn.testing.controller import input_of, row, states
 from tests.models.builders import make_model, make_structured
 from tests.support.cart_pole import CartPole
 from tests.support.contracts import one_case
@@ -47,15 +48,14 @@ def test_regulation_of_a_linear_system_is_the_formula(n, m):
         inverse @ K @ q_k + A.T @ (kp * (r_k - q_k) + kd * (s_k - v_k))
         for q_k, v_k, r_k, s_k in zip(*(x.numpy() for x in (q, v, motion.q, motion.v)), strict=True)
     ]
-    u = law(0.0, q, v, motion)
+    u = input_of(law, q, v, motion)
     assert_near(u, torch.tensor(np.array(expected)), 1e-12)
-    assert_near(law.law(q, v, *motion), u, 1e-12)
 
 
 def test_proportional_derivative_is_the_feedback_through_the_input_matrix():
     q, v, motion = states(2)
     system = linear_system(2, 3)
-    u = ProportionalDerivative(system, 3.0, 2.0)(0.0, q, v, motion)
+    u = input_of(ProportionalDerivative(system, 3.0, 2.0), q, v, motion)
     feedback = 3.0 * (motion.q - q) + 2.0 * (motion.v - v)
     expected = feedback.numpy() @ system.inputs.detach().numpy()
     assert_near(u, torch.from_numpy(expected), 1e-12)
@@ -76,7 +76,8 @@ def test_laws_on_the_cart_pole_are_their_formulas(law):
     coupling = 0.4 * 0.6
     force = 1.9 * a + coupling * (angle.cos() * alpha - angle.sin() * rate**2) + 0.3 * speed + 4 * x
     expected = force if law is ComputedTorque else force + pd[:, 0]
-    assert_near(law(CartPole(), [3.0, 5.0], [1.0, 2.0])(0.0, q, v, motion)[:, 0], expected, 1e-12)
+    u = input_of(law(CartPole(), [3.0, 5.0], [1.0, 2.0]), q, v, motion)
+    assert_near(u[:, 0], expected, 1e-12)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def system(request):
 
 def test_regulation_on_the_truth_holds_the_robot_where_it_should_be(system):
     q, v, _ = states(system.num_coordinates)
-    u = Regulation(system, 10.0, 1.0)(0.0, q, 0 * v, Motion(q, 0 * v, 0 * v))
+    u = input_of(Regulation(system, 10.0, 1.0), q, 0 * v, Motion(q, 0 * v, 0 * v))
     unheld = system.forward_dynamics(q, 0 * v, 0 * u).detach()
     a = system.forward_dynamics(q, 0 * v, u).detach()
     assert float(unheld.abs().max()) > 1e-2
@@ -120,7 +121,7 @@ def test_regulation_on_the_truth_holds_the_robot_where_it_should_be(system):
 
 def test_tracking_on_the_truth_gives_the_acceleration_of_the_reference(system):
     *_, motion = states(system.num_coordinates)
-    u = Tracking(system, 10.0, 1.0)(0.0, motion.q, motion.v, motion)
+    u = input_of(Tracking(system, 10.0, 1.0), motion.q, motion.v, motion)
     a = system.forward_dynamics(motion.q, motion.v, u).detach()
     assert_near(a, motion.a, 1e-9)
 
@@ -129,7 +130,7 @@ def test_computed_torque_on_the_truth_gives_the_linear_error_dynamics(system):
     q, v, motion = states(system.num_coordinates)
     kp = torch.linspace(4.0, 9.0, system.num_coordinates, dtype=torch.float64)
     kd = 2 * kp.sqrt()
-    u = ComputedTorque(system, kp, kd.tolist())(0.0, q, v, motion)
+    u = input_of(ComputedTorque(system, kp, kd.tolist()), q, v, motion)
     error_acceleration = motion.a - system.forward_dynamics(q, v, u).detach()
     assert_near(error_acceleration, -kd * (motion.v - v) - kp * (motion.q - q), 1e-9)
 
@@ -150,16 +151,27 @@ class HalfSingular(CartPole):
 
 def test_a_singular_input_matrix_is_a_fault_of_its_row_only():
     q, v, motion = states(2)
-    expected = Regulation(HalfSingular(), 1.0, 1.0)(0.0, q, v, motion)
+    expected = input_of(Regulation(HalfSingular(), 1.0, 1.0), q, v, motion)
     q = q.clone()
     q[1, 0], q[4, 0] = 0.0, 1e-4
-    law = Regulation(HalfSingular(), 1.0, 1.0, max_condition=1e3)
-    u = law(0.0, q, v, motion)
-    ((reason, mask),) = law.faults().items()
-    assert "max_condition = 1000" in reason
-    assert mask.tolist() == [False, True, False, False, True, False]
-    assert not torch.isfinite(u[1]).all()
-    assert_near(u[[0, 2, 3, 5]], expected[[0, 2, 3, 5]], 1e-12)
+    pipeline = Pipeline(Regulation(HalfSingular(), 1.0, 1.0, max_condition=1e3))
+    result = pipeline.call(q, v, motion, torch.zeros(len(q), pipeline.memory_size).double())
+    assert result.status.tolist() == [0, 8 + 4, 0, 0, 8, 0]
+    assert (result.u[1] == 0).all()  # the input before the first call
+    assert_near(result.u[[0, 2, 3, 5]], expected[[0, 2, 3, 5]], 1e-12)
+
+
+def test_the_condition_number_is_the_ratio_of_singular_values_up_to_the_rank():
+    generator = torch.Generator().manual_seed(0)
+    for shape in ((3, 3), (2, 4), (4, 2)):
+        A = torch.randn(20, *shape, generator=generator).double()
+        ratio = torch.linalg.cond(A)
+        found = condition_number(A)
+        assert (found <= ratio * (1 + 1e-9)).all()
+        assert (found >= ratio / min(shape)).all()
+    assert_near(condition_number(3 * torch.eye(4).double()), torch.ones(()).double(), 1e-12)
+    lost = torch.tensor([[[1.0, 2.0], [2.0, 4.0]], [[1.0, torch.nan], [0.0, 1.0]]]).double()
+    assert not (condition_number(lost) < 1e6).any()
 
 
 # Deployment.
@@ -174,17 +186,11 @@ def test_the_formula_can_be_exported(law, kind, num_inputs):
     controller = law(make_model(kind, 2, num_inputs).requires_grad_(False), 5.0, 1.0)
     q, v, motion = states(2)
 
-    class Formula(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.model = controller.model
-
-        def forward(self, *state):
-            return controller.law(*state)
-
-    exported = torch.export.export(Formula(), (q, v, *motion)).module()
+    pipeline, memory = Pipeline(controller), torch.zeros(1 + num_inputs).double()
+    exported = torch.export.export(pipeline, (q[0], v[0], *row(motion, 0), memory)).module()
     other = states(2, seed=6)
-    assert_near(exported(*other[:2], *other[2]), controller(0.0, *other), 1e-12)
+    u, _, _ = exported(other[0][0], other[1][0], *row(other[2], 0), memory)
+    assert_near(u, input_of(controller, *other)[0], 1e-12)
 
 
 # Errors.

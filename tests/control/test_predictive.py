@@ -1,5 +1,7 @@
 """Predictive control: optimal plans, limits, failures, references ahead of time."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -8,14 +10,15 @@ from scipy.optimize import lsq_linear
 
 from pinn_dyn.control import (
     Actuator,
+    Pipeline,
     PointToPoint,
     PredictiveControl,
     Regulation,
     SetPoint,
     SystemPlant,
     close_loop,
-    close_loop_continuous,
 )
+from pinn_dyn.testing.controller import input_of
 from pinn_dyn.testing.linear_system import damped_oscillators
 from tests.support.linear import Pendulums, double
 
@@ -54,7 +57,7 @@ def test_without_limits_it_is_the_linear_quadratic_regulator():
     Q, R = STEP * np.diag([1, 1, 0.2, 0.2]), STEP * 0.05 * np.eye(1)
     P = solve_discrete_are(A, B, Q, R)
     gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    u = law(0.0, *torch.from_numpy(x).split(2), SetPoint([0.0, 0.0])(0.0))
+    u = input_of(law, *torch.from_numpy(x).split(2), SetPoint([0.0, 0.0])(0.0))
     np.testing.assert_allclose(u, -gain @ x, rtol=1e-5)
 
 
@@ -76,8 +79,10 @@ def test_with_limits_it_is_the_bounded_least_squares_solution():
     right = np.concatenate([-np.sqrt(weight).ravel() * np.ravel(free), np.zeros(steps)])
     optimum = lsq_linear(rows, right, (-high, high), tol=1e-12).x
     assert (np.abs(optimum) > high - 1e-6).sum() in range(1, steps)
-    law(0.0, *torch.from_numpy(x).split(2), SetPoint([0.0, 0.0])(0.0))
-    np.testing.assert_allclose(law.plans[0].u[0], optimum, atol=1e-4)
+    q, v = torch.from_numpy(x).split(2)
+    memory, zero = torch.zeros(law.memory_size).double(), torch.zeros(1).double()
+    _, memory, _ = law.step(q, v, SetPoint([0.0, 0.0])(0.0), zero, memory)
+    np.testing.assert_allclose(law.plans(memory)[1][0], optimum, atol=1e-4)
 
 
 def test_it_respects_the_limits_and_beats_the_clipped_law():
@@ -134,10 +139,9 @@ def test_a_new_run_forgets_the_previous_run(law):
 
 def test_it_sees_the_reference_ahead_of_time(law):
     move = PointToPoint([0.0], [1.5], duration=0.5, begin=0.3)
-    ahead = run(law, move)
-    law_without = PredictiveControl(pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
-    law_without.follow = lambda reference: None
-    errors = [(x.q - x.reference.q).abs().max() for x in (ahead, run(law_without, move))]
+    without = copy.copy(law)
+    without.ahead = (0.0,)
+    errors = [(x.q - x.reference.q).abs().max() for x in (run(law, move), run(without, move))]
     assert errors[0] < 0.5 * errors[1]
 
 
@@ -185,43 +189,34 @@ def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
     assert "leaves the limits of q[0]" in caplog.text
 
 
-def test_continuous_time_is_refused(law):
-    start = double([[0.0]]), double([[0.0]])
-    settings = {"duration": 0.2, "samples_rate": 20.0}
-    with pytest.raises(ValueError, match="set a rate"):
-        close_loop_continuous(pendulum(), law, SetPoint([1.0]), *start, **settings)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("k", [0, 1])
 def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
     law = PredictiveControl(pendulum(), 0.6, STEP, observer_bandwidth=5.0)
-    goal = SetPoint([1.0])(0.0)
+    pipeline, goal = Pipeline(law, STEP), SetPoint([1.0])(0.0)
     states = [double([[0.1]]), double([[0.0]])]
-    first = law(0.0, *states, goal)
     broken = [x + bad if i == k else x for i, x in enumerate(states)]
-    assert torch.equal(law(STEP, *broken, goal), first)
-    assert law.diagnostics()["solver_failed"].tolist() == [1.0]
-    after = law(2 * STEP, *states, goal)
-    assert law.diagnostics()["solver_failed"].tolist() == [0.0]
-    assert after.isfinite().all()
-    law.reset()
-    assert not law(0.0, *broken, goal).any()  # nothing was applied before
+    zero = torch.zeros(1, pipeline.memory_size).double()
+    first = pipeline.call(*states, goal, zero)
+    second = pipeline.call(*broken, goal, first.memory)
+    assert torch.equal(second.u, first.u)
+    assert second.report["solver_failed"].tolist() == [1.0]
+    third = pipeline.call(*states, goal, second.memory)
+    assert third.report["solver_failed"].tolist() == [0.0]
+    assert third.u.isfinite().all()
+    assert not pipeline.call(*broken, goal, zero).u.any()  # nothing was applied before
 
 
-def test_times_limits_and_references_that_are_not_numbers_are_named():
+def test_limits_and_references_that_are_not_numbers_are_named():
     law = PredictiveControl(pendulum(), 0.6, STEP)
     state, goal = [double([[0.1]]), double([[0.0]])], SetPoint([1.0])(0.0)
-    with pytest.raises(ValueError, match="t is nan, expected the time of the call in s"):
-        law(np.nan, *state, goal)
-    with pytest.raises(ValueError, match=r"the reference of v\[0\] at 0 s is not finite"):
-        law(0.0, *state, goal._replace(v=double([np.nan])))
+    with pytest.raises(ValueError, match=r"the reference of v\[0\] 0 s ahead is not finite"):
+        input_of(law, *state, goal._replace(v=double([np.nan])))
     for name in ("q_low", "v_max", "position_weight"):
         with pytest.raises(ValueError, match=rf"{name} is nan, expected 1 or 1 numbers"):
             PredictiveControl(pendulum(), 0.6, STEP, **{name: np.nan})
     with pytest.raises(ValueError, match="low nan and high None, expected low <= high"):
         Actuator(low=np.nan)
-    law.reset()
 
 
 def test_values_that_do_not_fit_are_named():

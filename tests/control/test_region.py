@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.control import Motion
+from pinn_dyn.control import Motion, Pipeline, SetPoint, SystemPlant, close_loop
 from pinn_dyn.control.laws import Regulation
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.testing import ControllerContract, LinearSystem
@@ -14,7 +14,7 @@ from pinn_dyn.testing.controller import states
 from tests.support.contracts import one_case
 from tests.support.linear import double
 
-LOGGER = "pinn_dyn.control.region"
+LOGGER = "pinn_dyn.control.closed_loop"
 
 
 def comb(count=50):
@@ -120,26 +120,25 @@ REST = Motion(*(torch.zeros(1, dtype=torch.float64) for _ in range(3)))
 
 
 def test_the_law_is_unchanged_and_the_distance_recorded():
-    guarded = guard()
-    u = guarded(0.5, MIXED, 0 * MIXED, REST)
-    assert u == pytest.approx(0.5 * MIXED - 12 * MIXED, rel=1e-12)  # 2 q / 4 - 4 * 3 q, by hand
-    found = guarded.diagnostics()
-    assert found["distance"] == pytest.approx(double([0.0, 4.5, 1.5, 9.0]))
-    assert found["outside"].tolist() == [0, 1, 0, 1]
-    assert found["input_condition"].tolist() == [1, 1, 1, 1]
+    pipeline = Pipeline(guard())
+    result = pipeline.call(MIXED, 0 * MIXED, REST, torch.zeros(4, pipeline.memory_size).double())
+    assert result.u == pytest.approx(0.5 * MIXED - 12 * MIXED, rel=1e-12)  # 2 q / 4 - 4 * 3 q
+    assert result.report["distance"] == pytest.approx(double([0.0, 4.5, 1.5, 9.0]))
+    assert result.report["outside"].tolist() == [0, 1, 0, 1]
+    assert result.status.tolist() == [0, 2, 0, 2]
+    assert result.report["input_condition"].tolist() == [1, 1, 1, 1]
 
 
 def test_one_warning_in_each_run(caplog):
-    guarded = guard()
-    with caplog.at_level(logging.WARNING, LOGGER):
-        for run in (1, 2):
-            guarded.reset()
-            guarded(0.0, MIXED[:1], 0 * MIXED[:1], REST)
-            assert len(caplog.messages) == run - 1
-            for t in (0.25, 0.5, 0.75):
-                guarded(t, MIXED, 0 * MIXED, REST)
-            assert len(caplog.messages) == run
-    assert "t = 0.25 s: 2 of 4 states are outside" in caplog.messages[-1]
+    """Two of four copies start outside, at rest, and the law pulls them in."""
+    for run in (1, 2):
+        with caplog.at_level(logging.WARNING, LOGGER):
+            close_loop(
+                SystemPlant(spring()), guard(), SetPoint([5.0]), MIXED, 0 * MIXED, duration=0.1,
+                rate=100,
+            )  # fmt: skip
+        assert len(caplog.messages) == run
+    assert "t = 0 s: 2 of 4 states are outside" in caplog.messages[-1]
     assert "up to 9 (" in caplog.messages[-1]
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 import yaml
 
-from pinn_dyn.control.stability import fit_factor
+from pinn_dyn.evaluation.learned_terms import fit_factor
 from pinn_dyn.mechanics import Terms
 from pinn_dyn.systems import SoftArm
 from reproduce import ENTRIES, read_entries

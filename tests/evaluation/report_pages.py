@@ -179,7 +179,6 @@ def control_page(names=("learned", "pd"), title="a loop", animation=None):
         },
         labels=LABELS,
         animation=animation,
-        stability="# Stability\n\n| a | b |\n|---|---|\n| A_L | 2 |\n",
         origin=origin(names),
     )
     return page, result.table

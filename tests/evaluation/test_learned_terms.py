@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from pinn_dyn.control.stability import fit_factor
 from pinn_dyn.evaluation import compare_terms, terms_figure
+from pinn_dyn.evaluation.learned_terms import fit_factor
 from pinn_dyn.mechanics import MechanicalSystem, Terms
 from pinn_dyn.systems import SoftArm
 

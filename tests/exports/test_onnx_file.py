@@ -8,7 +8,7 @@ import onnxruntime
 import pytest
 import torch
 
-from pinn_dyn.control import Actuator, Tracking, export_law
+from pinn_dyn.control import Actuator, Pipeline, Tracking, export_law
 from pinn_dyn.exports.exported import ExportedFunction, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.run.export import export
@@ -49,16 +49,17 @@ def test_a_law_keeps_its_memory_between_calls_and_says_what_it_is(tmp_path):
     path = export_law(
         law, tmp_path / "law.onnx", actuator=Actuator(rate=20.0), period=0.01, about=about
     )
-    session, actuator, memory = session_of(path), Actuator(rate=20.0), np.zeros((1, 3))
+    pipeline = Pipeline(law, 0.01, actuator=Actuator(rate=20.0))
+    session, memory = session_of(path), np.zeros((1, pipeline.memory_size))
     names = [x.name for x in session.get_inputs()]
     assert names == ["q", "v", "q_ref", "v_ref", "a_ref", "memory_in"]
     for k in range(10):
         state = [torch.sin(k + torch.arange(3.0).double() + i) for i in range(5)]
         inputs = dict(zip(names, [*(x.numpy()[None] for x in state), memory], strict=True))
+        expected, changed, _ = pipeline(*state, torch.from_numpy(memory[0]))
         u, status, memory = session.run(["u", "status", "memory_out"], inputs)
-        expected, changed = actuator(law.law(*state), 0.01)
-        np.testing.assert_allclose(u[0], expected.detach(), rtol=1e-9)
-        assert status == [int(changed.any())]
+        np.testing.assert_allclose(u[0], expected, rtol=1e-9)
+        assert status == [int(changed)]
     fields = {item.key: item.value for item in onnx.load(path).metadata_props}
     assert json.loads(fields["q"]) == about["q"]
     assert json.loads(fields["position_gain"]) == [3.0] * 3

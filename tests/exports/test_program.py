@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pinn_dyn.control import ComputedTorque
+from pinn_dyn.control import ComputedTorque, Pipeline
 from pinn_dyn.exports.decompositions import cholesky, pseudo_inverse, qr, solve_triangular
 from pinn_dyn.exports.program import trace
 from pinn_dyn.systems import SoftArm
@@ -18,14 +18,15 @@ MODELS = {
 @pytest.mark.parametrize("case", MODELS)
 def test_a_program_repeats_a_law(case):
     model = MODELS[case]().requires_grad_(False)
-    law = ComputedTorque(model, 3.0, 0.4).law
-    arguments = ["q", "v", "q_ref", "v_ref", "a_ref"]
+    law = Pipeline(ComputedTorque(model, 3.0, 0.4))
+    arguments = ["q", "v", "q_ref", "v_ref", "a_ref", "memory_in"]
+    memory = torch.rand(5, law.memory_size).double()
     q, v, a, _ = random_batch(model.num_coordinates, model.num_inputs, batch=5, seed=3)
-    example, *states = zip(q, v, q + a, v - a, a, strict=True)
-    program = trace(law, dict(zip(arguments, example, strict=True)), ["u"])
+    example, *states = zip(q, v, q + a, v - a, a, memory, strict=True)
+    program = trace(law, dict(zip(arguments, example, strict=True)), ["u", "status", "memory"])
     assert list(program.inputs) == arguments
     for state in states:
-        torch.testing.assert_close(program(*state)[0], law(*state), rtol=1e-11, atol=1e-13)
+        torch.testing.assert_close(program(*state), law(*state), rtol=1e-11, atol=1e-13)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])

@@ -10,6 +10,7 @@ import torch
 from pinn_dyn import check
 from pinn_dyn.control import (
     ComputedTorque,
+    Pipeline,
     PredictiveControl,
     SetPoint,
     SystemPlant,
@@ -158,13 +159,15 @@ def test_a_law_asks_for_what_the_drive_has():
     law = ComputedTorque(model, 100.0, 20.0)
     at = torch.zeros(2, 1).double()
     goal = Motion(torch.tensor([[0.02], [2.0]]).double(), 0 * at, 0 * at)
-    u = law(0.0, at, at, goal)
+    pipeline = Pipeline(law)
+    memory = torch.zeros(*at.shape[:-1], pipeline.memory_size).double()
+    u, status, _ = pipeline(at, at, *goal, memory)
     torque = model.motor_force(at, at, u)
     assert float(torque[0, 0]) == pytest.approx(
         float(model.inverse_dynamics(at, at, 100 * goal.q)[0, 0])
     )
     assert float(torque[1, 0]) == pytest.approx(0.98 * LIMIT, rel=1e-3)
-    assert not any(fault.any() for fault in law.faults().values())
+    assert not status.any()
 
 
 def test_a_plan_keeps_within_the_drive():

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from pinn_dyn.control import Controller, Motion, Reference
+from pinn_dyn.control import Motion, Reference, Stage, Step
 from pinn_dyn.control.closed_loop import close_loop
 from pinn_dyn.control.plants import SystemPlant
 from pinn_dyn.mechanics import MechanicalSystem
@@ -26,24 +26,18 @@ class Wave(Reference):
         return Motion(a * np.sin(2 * t), 2 * a * np.cos(2 * t), -4 * a * np.sin(2 * t))
 
 
-class PD(Controller):
-    """PD with the time of each call as a diagnostic; copies for whom ``bad(t, q)`` are faulty."""
+class PD(Stage):
+    """PD whose input is NaN for the copies with ``bad(q)``, with |q| in its report."""
 
     def __init__(self, size=2, k_p=K_P, k_d=K_D, bad=None):
         super().__init__(size, size)
         self.k_p, self.k_d, self.bad = k_p, k_d, bad
 
-    def __call__(self, t, q, v, reference):
-        assert q.isfinite().all()
-        assert v.isfinite().all()
-        self.q, self.time = q, t
-        return self.k_p * (reference.q - q) + self.k_d * (reference.v - v)
-
-    def diagnostics(self):
-        return {"time": torch.full(self.q.shape[:-1], self.time)}
-
-    def faults(self):
-        return {} if self.bad is None else {"too far": self.bad(self.time, self.q)}
+    def step(self, q, v, reference, applied, memory):
+        u = self.k_p * (reference.q - q) + self.k_d * (reference.v - v)
+        if self.bad is not None:
+            u = torch.where(self.bad(q)[:, None], torch.nan, u)
+        return Step(u, memory, {"distance": q.norm(dim=-1)})
 
 
 def spring(inputs=((1.0, 0.0), (0.3, 0.8))):

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 import pinn_dyn
-from pinn_dyn.control.laws import Regulation
-from pinn_dyn.control.stability import certify
+from pinn_dyn.control import Motion, Regulation
 from pinn_dyn.data import draw_windows
 from pinn_dyn.identification.constants import constants_table, undetermined
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.models.learned_constants import Slopes
 from pinn_dyn.systems import RigidChain
+from pinn_dyn.testing.controller import input_of
 from pinn_dyn.training import LeastSquares
 from tests.support.underactuated import (
     ACROBOT,
@@ -128,12 +128,9 @@ def test_an_acrobot_is_predicted_on_another_motion(acrobot):
 def test_laws_use_what_an_acrobot_drives(acrobot):
     model, q = copy.deepcopy(acrobot[0]), torch.tensor([[0.3, 0.4]]).double()
     law = Regulation(model, 5.0, 1.0)
-    motion = [q, 0 * q, 0 * q]
-    u = law.law(q, 0 * q, *motion)
+    u = input_of(law, q, 0 * q, Motion(q, 0 * q, 0 * q))
     force = model.potential_force(q)[:, 1:] / model.drive_gain()[1]
     torch.testing.assert_close(u, force)
-    with pytest.raises(ValueError, match="needs N = M inputs, the robot has M = 1"):
-        certify(model, model, q, 5.0, 1.0)
 
 
 def test_fewer_inputs_than_joints_need_the_names_of_the_driven_joints(acrobot):

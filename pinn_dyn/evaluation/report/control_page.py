@@ -15,7 +15,6 @@ from pinn_dyn.evaluation.report.page import (
     Section,
     details,
     drawing,
-    from_markdown,
     page,
     paragraph,
     picture,
@@ -43,12 +42,11 @@ def control_report(
     figures: Mapping[str, Figure],
     labels: Sequence[str],
     animation: Path | None,
-    stability: str | None,
     origin: Origin,
 ) -> str:
     """Return the page as HTML text.
 
-    ``animation`` is a GIF of the first law, ``stability`` a report in Markdown, or None.
+    ``animation`` is a GIF of the first law, or None.
     """
     sections = [
         Section("Summary", _summary(result, labels)),
@@ -57,8 +55,6 @@ def control_report(
     if animation is not None:
         gif = picture(animation.read_bytes(), "gif", "animation of the first law in real time")
         sections.append(Section("Animation", [gif]))
-    if stability is not None:
-        sections.append(Section("Stability", [from_markdown(stability)]))
     record = next(iter(result.records.values()))
     runs, duration = len(record.stopped), float(record.t[-1] - record.t[0])
     subtitle = f"{runs} run{'s' if runs > 1 else ''} of {duration:g} s"

@@ -1,5 +1,7 @@
+import importlib.util
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,14 +9,20 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from pinn_dyn.control.stability import certify, factor_bounds, fit_factor
-from pinn_dyn.control.stability_report import stability_report
-from pinn_dyn.control.steady_state import predict_steady_state, required_gain
+from pinn_dyn.evaluation.learned_terms import fit_factor
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem
 from tests.support.cart_pole import CartPole
 from tests.support.linear import double
+
+_path = Path(__file__).parents[2] / "examples" / "paper" / "proposition_1.py"
+_spec = importlib.util.spec_from_file_location("proposition_1", _path)
+paper = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(paper)
+certify, factor_bounds = paper.certify, paper.factor_bounds
+predict_steady_state, required_gain = paper.predict_steady_state, paper.required_gain
+stability_report = paper.stability_report
 
 P = torch.tensor([[2.0, 0.3], [-0.1, 1.5]], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)
