@@ -22,7 +22,7 @@ _ALL = 1e-2  # weight of all z and z', relative
 class LatentMechanics:
     """Oscillators as the system of a plan, with coordinates z and velocities dz/dt in 1/s::
 
-        d^2z/dt^2 = (f(u) - K z - T D dz/dt - W^T tanh(W z + b)) / T^2
+        d^2z/dt^2 = (f(u, 0) - K z - T D dz/dt - W^T tanh(W z + b)) / T^2
 
     Symbols: those of :class:`CoupledOscillators`; step T of the training windows, s.
     """

@@ -26,7 +26,7 @@ from tests.support.c_code import function_of
 
 
 def make_oscillators(output):
-    torch.manual_seed(2)
+    torch.manual_seed(3)
     sizes = {"oscillators": 6, "hidden": [8], "force_hidden": [8]}
     model = CoupledOscillators(make_statistics(2, 2), output=output, **sizes)
     parts = [model.output, model.force] if output == "network" else [model.force]

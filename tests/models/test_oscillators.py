@@ -47,7 +47,8 @@ def test_a_step_solves_the_equation_of_motion_at_the_mean_state():
     x = network(model.encoder, (np.concatenate([x0.numpy(), u[0].numpy()]) - mean) / std)
     y = [network(model.output, x)]
     for k in range(5):
-        force = (network(model.force, ends[k]) + network(model.force, ends[k + 1])) / 2
+        mean_and_change = [(ends[k] + ends[k + 1]) / 2, 5 * (ends[k + 1] - ends[k])]
+        force = network(model.force, np.concatenate(mean_and_change))
         z, v = np.split(x, 2)
 
         def residual(later, z=z, v=v, force=force):
@@ -64,6 +65,14 @@ def test_a_step_solves_the_equation_of_motion_at_the_mean_state():
     t = STEP * torch.arange(6).double()
     found = model.predict(x0, t, Signal(t, u))
     assert_near(found, torch.from_numpy(mean[:4] + std[:4] * np.array(path)), 1e-7)
+
+
+def test_weights_of_a_force_without_changes_of_the_inputs_are_refused():
+    model = oscillators()
+    weights = model.state_dict()
+    weights["force.first.weight"] = weights["force.first.weight"][:, :2]
+    with pytest.raises(ValueError, match="without the change of the inputs .* train the model"):
+        model.load_state_dict(weights)
 
 
 def test_a_step_follows_the_equation_of_motion():
@@ -105,7 +114,7 @@ def test_energy_never_rises_under_a_constant_input(spread, output):
         z, v = path.split(N, dim=-1)
         x = z @ W.T + b
         log_cosh = x.abs() + torch.log1p(torch.exp(-2 * x.abs())) - math.log(2)
-        force = model.force(torch.ones(2).double())
+        force = model.step_force(torch.ones(4).double())
         energy = (z @ K * z).sum(-1) / 2 + log_cosh.sum(-1) + v.square().sum(-1) / 2 - z @ force
         assert energy.diff(dim=0).max() <= 1e-9 * energy.abs().max()
         assert (energy[-1] < energy[0]).all()
@@ -128,8 +137,7 @@ def test_rollouts_are_bounded_for_any_parameters(spread):
         u = 5 * torch.randn(3, 2001, 4, generator=torch.manual_seed(seed)).double()
         ends = u[:, :-1].movedim(0, 1)
         far = 1e3 * torch.randn(3, 2 * N, generator=torch.manual_seed(seed)).double()
-        start, end = ends.chunk(2, dim=-1)
-        force = (model.force(start) + model.force(end)).norm(dim=-1).max() / 2
+        force = model.step_force(ends).norm(dim=-1).max()
         largest = force + torch.linalg.matrix_norm(model.coupling, 2) * N**0.5
         step = torch.linalg.matrix_norm(root @ B, 2) * largest
         path = torch.stack(model.latent_path(far, ends)) @ root.T
