@@ -71,7 +71,7 @@ def test_weights_of_a_force_without_changes_of_the_inputs_are_refused():
     model = oscillators()
     weights = model.state_dict()
     weights["force.first.weight"] = weights["force.first.weight"][:, :2]
-    with pytest.raises(ValueError, match="without the change of the inputs .* train the model"):
+    with pytest.raises(ValueError, match="without the change of the inputs"):
         model.load_state_dict(weights)
 
 
