@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -48,18 +48,6 @@ def _slopes(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """Return dy/dx ``(*batch, n, m)`` of y = f(x) ``(*batch, n)``, row by row."""
     rows = torch.func.vmap(torch.func.jacrev(function))(x.reshape(-1, x.shape[-1]))
     return rows.reshape(*x.shape[:-1], *rows.shape[1:])
-
-
-def _refuse_force_without_changes(
-    force: LinearAndMLP, state: dict[str, Tensor], prefix: str, *_: Any
-) -> None:
-    """Refuse the weights of a force of earlier versions, a function of u alone."""
-    weight = state.get(f"{prefix}first.weight")
-    if weight is not None and 2 * weight.shape[-1] == force.first.weight.shape[-1]:
-        raise ValueError(
-            "the force of these oscillators is of an earlier form, without the change of the "
-            "inputs over a step: train the model again"
-        )
 
 
 class MeasuredCoordinates(nn.Module):
@@ -147,7 +135,7 @@ class CoupledOscillators(EncodedPredictor):
         hidden, activation: widths and activation of the hidden layers of encoder and output.
         force_hidden: widths of the hidden layers of f.
         output: network of (z, z'), or the first coordinates of z.
-        fade, initial_velocity: see :class:`EncodedPredictor`. fade has no effect on coordinates.
+        initial_velocity: see :class:`EncodedPredictor`.
 
     Raises:
         ValueError: if ``output="coordinates"`` leaves no hidden coordinate.
@@ -162,12 +150,11 @@ class CoupledOscillators(EncodedPredictor):
         activation: Activation = "tanh",
         force_hidden: Sequence[PositiveInt] = (64,),
         output: Literal["network", "coordinates"] = "network",
-        fade: Annotated[float, Field(gt=0, lt=1)] = 0.5,
         initial_velocity: InitialVelocityHead | None = None,
     ):
         self._force_hidden = force_hidden
         sizes = 2 * oscillators, hidden, activation
-        super().__init__(statistics, history, *sizes, fade, initial_velocity)
+        super().__init__(statistics, history, *sizes, initial_velocity)
         if output == "coordinates":
             self._measure_coordinates(hidden, activation)
 
@@ -179,8 +166,6 @@ class CoupledOscillators(EncodedPredictor):
         speed = self.step * self.std[size : 2 * size] / self.std[:size]
         self.output = MeasuredCoordinates(n, speed.float())
         self.encoder = HiddenStart(self.output, len(self.mean), hidden, activation)
-        del self.fade
-        self.register_buffer("fade", torch.zeros(2 * size))
 
     def _add_transition(
         self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation
@@ -189,7 +174,6 @@ class CoupledOscillators(EncodedPredictor):
         frequency = torch.linspace(math.log(_SLOWEST), math.log(_FASTEST), n)
         mixed = _SPREAD * torch.randn(2, n, n) / n**0.5
         self.force = LinearAndMLP(2 * inputs, n, self._force_hidden, activation)
-        self.force.register_load_state_dict_pre_hook(_refuse_force_without_changes)
         self.stiffness = nn.Parameter(torch.diag(frequency) + mixed[0].tril(-1))
         damping = (frequency + math.log(2 * _DAMPING)) / 2
         self.damping = nn.Parameter(torch.diag(damping) + mixed[1].tril(-1))

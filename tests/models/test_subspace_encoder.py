@@ -27,6 +27,15 @@ def network(part, x):
     return linear + h
 
 
+def faded(model, start, outputs):
+    """States y_1, ... from the outputs at z_0, z_1, ... and the offset of the start."""
+    fade, share = 1 / (1 + np.exp(-model.fade.numpy())), np.exp(10 * model.share.numpy())
+    share = share / share.sum(axis=-1, keepdims=True)
+    offset = start - outputs[0]
+    kept = [(share * fade**k).sum(axis=-1) for k in range(1, len(outputs))]
+    return [y + k * offset for y, k in zip(outputs[1:], kept, strict=True)]
+
+
 def by_hand(model, q, v, u, k, steps):
     """States from sample k on, of a motion with samples a step apart."""
     s = make_statistics(2, 2)
@@ -35,12 +44,11 @@ def by_hand(model, q, v, u, k, steps):
     past = [*zq[k - 3 : k][::-1].flat, *zu[k - 3 : k + 1][::-1].flat]
     z = network(model.encoder, np.array([*zq[k], *(v[k] / v_std), *past]))
     start = np.concatenate([zq[k], v[k] / v_std])
-    path, fade = [], 1 / (1 + np.exp(-model.fade.numpy()))
-    offset = start - network(model.output, z)
+    outputs = [network(model.output, z)]
     for j in range(steps):
         z = z + network(model.transition, np.concatenate([z, zu[k + j], zu[k + j + 1]]))
-        path.append(network(model.output, z) + fade ** (j + 1) * offset)
-    y = np.array([start, *path])
+        outputs.append(network(model.output, z))
+    y = np.array([start, *faded(model, start, outputs)])
     return np.hstack([s.q_mean.numpy() + q_std * y[:, :2], v_std * y[:, 2:]])
 
 
