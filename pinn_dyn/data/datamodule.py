@@ -28,7 +28,7 @@ class DynamicsData:
         steps: steps H of a window; 1 gives the paper's transition pairs.
         stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``.
             ``"auto"`` is about a tenth of a period of the fastest input, or of the fastest motion
-            if that is slower.
+            if that is slower, without noise and holds of the inputs.
         batch_size: windows in a batch.
         batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.
