@@ -17,7 +17,8 @@ from pinn_dyn.control import DataRegion, Plant, SystemPlant
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.c_draws import LoopOfDraws
-from pinn_dyn.exports.c_loop import CLoop, Loop
+from pinn_dyn.exports.c_loop import CLoop
+from pinn_dyn.exports.compiled import Function
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.run.run import Run
@@ -67,7 +68,7 @@ class ModelPlant(Plant):
         self._models = [model_for_rollouts(x) for x in draws or [model]]
         self._model, self._step, self._threads = self._models[0], step, threads
         self._delay = torch.zeros(model.num_inputs) if delay is None else delay
-        self._loop: Loop | None = None
+        self._loop: Function | None = None
         self._has_draws_in_c = True
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
@@ -134,7 +135,7 @@ class ModelPlant(Plant):
                     v[rows] = model.velocity(q[rows], p[rows])
         return q, v
 
-    def _ready(self) -> Loop | None:
+    def _ready(self) -> Function | None:
         if len(self._models) == 1:
             integrator = cast(CLoop, self._model.integrator)
             return integrator.ready(self._model, self._x, self._step)

@@ -11,7 +11,6 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.record import ClosedLoopRecord
-from pinn_dyn.exports.c_loop import expected_calls
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.progress import Progress
@@ -66,7 +65,6 @@ def close_loop(
     try:
         with (
             torch.no_grad(),
-            expected_calls(len(run.t)),
             Progress(progress, len(run.t), "instants") as lines,
         ):
             plant.start(q0, v0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from typing import Annotated
 
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.effects import Actuator
-from pinn_dyn.exports.c_loop import rows_in_c
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import CoupledOscillators
 
@@ -141,7 +140,7 @@ class LatentLaw(Controller):
         self.stored_inputs = int(self.dead_time / period + _ROUNDING) + 2
         gains = self.position_gain, self.velocity_gain, self.integral_gain, self.noise
         settings = period, self.dead_time, gains, self.actuator, self._first_input.tolist()
-        self._name = hashlib.sha256(f"{settings}".encode()).hexdigest()
+        self._compiled = Compiled(self.model, settings)
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
@@ -164,7 +163,7 @@ class LatentLaw(Controller):
             past = torch.cat([older, self._past], dim=-2)[..., -self.stored_inputs :, :]
             motion = (x.expand_as(q) for x in reference[:2])
             rows = torch.cat([q, v, *motion, past.flatten(-2), self._memory], dim=-1)
-            result = rows_in_c(self.model, self._name, self._row, rows)(rows)
+            result = self._compiled.rows("law", self._row, rows)
             sizes = [M, self.memory_size, 1]
             u, self._memory, residual = result.split(sizes, dim=-1)
             last = None if is_first else past[..., -1, :]

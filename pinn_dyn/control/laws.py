@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import hashlib
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -12,7 +11,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
-from pinn_dyn.exports.c_loop import rows_in_c
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.mechanics import InputSolver, MechanicalSystem
 from pinn_dyn.mechanics.arrays import (
     jacobians,
@@ -78,6 +77,7 @@ class ModelBasedLaw(Controller):
         self.position_gain = diagonal_gain("position_gain", position_gain, self.num_coordinates)
         self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, self.num_coordinates)
         self.model = model
+        self._compiled = Compiled(type(self), model, self.position_gain, self.velocity_gain)
         self.max_condition = float(max_condition)
         self.solver = solver or InputSolver()
         self.reset()
@@ -115,9 +115,7 @@ class ModelBasedLaw(Controller):
             u, A, _ = self._input(q, v, Motion(*motion), None)
             return torch.cat([u, A.flatten(-2)], dim=-1)
 
-        gains = self.position_gain.tolist(), self.velocity_gain.tolist()
-        name = hashlib.sha256(f"{type(self).__name__} {gains}".encode()).hexdigest()
-        u, A = rows_in_c(self.model, name, function, rows)(rows).split(
+        u, A = self._compiled.rows("input", function, rows).split(
             [self.num_inputs, self.num_coordinates * self.num_inputs], dim=-1
         )
         return u, A.unflatten(-1, (self.num_coordinates, self.num_inputs))

@@ -9,13 +9,12 @@ from pydantic import PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Plant
-from pinn_dyn.exports.c_loop import rows_in_c
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Stepped
 
 # Far below any step that the motion of a robot needs, s.
 _SMALLEST_STEP = 1e-6
-_SLOPES = 7  # of a step of RK45, and of its start
 
 
 class SystemPlant(Plant):
@@ -35,7 +34,7 @@ class SystemPlant(Plant):
     ):
         self.num_coordinates = system.num_coordinates
         self.num_inputs = system.num_inputs
-        self._system = system
+        self._system, self._compiled = system, Compiled(system)
         self._rtol, self._atol = rtol, atol
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
@@ -58,13 +57,11 @@ class SystemPlant(Plant):
             return self._system.velocity_derivative(rows[..., :size], rows[..., size:])
 
         rows = torch.cat([x, u], dim=-1)
-        with torch.no_grad():
-            fast = rows_in_c(self._system, "velocity_derivative", rates, rows, calls=_SLOPES)
 
         def slope(time: float, flat: np.ndarray) -> np.ndarray:
             rows[:, :size] = torch.from_numpy(flat).view(x.shape)
             with torch.no_grad():
-                return fast(rows).numpy().ravel()
+                return self._compiled.rows("velocity_derivative", rates, rows).numpy().ravel()
 
         share = len(x) ** -0.5  # SciPy takes the root mean square over all copies
         solver = scipy.integrate.RK45(

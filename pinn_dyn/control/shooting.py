@@ -9,8 +9,8 @@ import scipy
 import torch
 from torch import Tensor
 
-from pinn_dyn.exports.c_library import compiled_rows
 from pinn_dyn.exports.casadi_function import import_casadi
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.mechanics import MechanicalSystem
 
 _STEP_SIZES = 0.5 ** np.arange(7)  # steps that the line search tries
@@ -85,11 +85,15 @@ class ShootingProblem:
         self._rows = [np.flatnonzero(np.isfinite(x)).tolist() for x in bounded]
         self._transcribe(import_casadi())
 
-        def dynamics(z: Tensor) -> Tensor:
-            return model.forward_dynamics(*z.split([n, n, m], dim=-1))
+        self._model, self._compiled = model, Compiled(model)
 
-        with torch.no_grad():
-            self._dynamics = compiled_rows(dynamics, torch.full((2 * n + m,), 0.1).double())
+    def _dynamics(self, z: Tensor) -> Tensor:
+        n, m = self.sizes
+
+        def dynamics(z: Tensor) -> Tensor:
+            return self._model.forward_dynamics(*z.split([n, n, m], dim=-1))
+
+        return self._compiled.rows("forward_dynamics", dynamics, z)
 
     def _transcribe(self, ca: Any) -> None:
         (n, m), h, steps = self.sizes, self.step, self.steps

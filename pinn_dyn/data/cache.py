@@ -18,6 +18,7 @@ from pinn_dyn.whole import whole
 log = logging.getLogger(__name__)
 
 Arrays = Mapping[str, np.ndarray]
+_ROUNDING = 1e-9
 
 
 def cache_key(description: object) -> str:
@@ -27,7 +28,11 @@ def cache_key(description: object) -> str:
 
 
 def load_or_make(
-    folder: Path, name: str, description: object, make: Callable[[], Arrays]
+    folder: Path,
+    name: str,
+    description: object,
+    make: Callable[[], Arrays],
+    prove: Callable[[Arrays], np.ndarray] | None = None,
 ) -> Arrays:
     """Load the arrays of a description from the cache, or make and store them.
 
@@ -39,24 +44,52 @@ def load_or_make(
         name: first part of the file name.
         description: everything that the arrays depend on, JSON-serializable.
         make: function that makes the arrays.
+        prove: function that computes some numbers for stored arrays, by the code that made them.
+            They are stored as ``proof``. Arrays with another proof up to rounding are made again.
     """
+
+    def proven() -> Arrays:
+        arrays = make()
+        return arrays if prove is None else {**arrays, "proof": prove(arrays)}
+
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{cache_key(description)}.npz"
     if path.exists() and not os.access(folder, os.W_OK):
-        return _read(path)
+        arrays = _read(path)
+        return arrays if _holds(arrays, prove, path) else proven()
     with FileLock(f"{path}.lock"):
         if path.exists():
             try:
-                return _read(path)
+                arrays = _read(path)
             except Exception as error:  # a damaged archive raises nearly anything
                 log.warning("cache file %s is damaged (%s): it is made again", path, error)
+            else:
+                if _holds(arrays, prove, path):
+                    return arrays
         # The holder of the lock is the only writer; other files are of killed processes.
         for partial in folder.glob(f"{glob.escape(path.name)}.*.partial"):
             partial.unlink(missing_ok=True)
-        arrays = make()
+        arrays = proven()
         with whole(path) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
     return arrays
+
+
+def _holds(arrays: Arrays, prove: Callable[[Arrays], np.ndarray] | None, path: Path) -> bool:
+    """Return true if the proof of stored arrays is the present one; else say that it is not."""
+    if prove is None:
+        return True
+    stored, present = arrays["proof"], prove(arrays)
+    if stored.shape == present.shape:
+        scale = _ROUNDING * np.abs(stored).max(initial=0.0, where=np.isfinite(stored))
+        if np.allclose(present, stored, rtol=_ROUNDING, atol=scale, equal_nan=True):
+            return True
+    log.warning(
+        "the recording %s does not follow the present code of its robot and excitation: "
+        "it is made again",
+        path,
+    )
+    return False
 
 
 def _read(path: Path) -> Arrays:

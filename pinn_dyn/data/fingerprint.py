@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import marshal
-import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 _MODULE_ATTRIBUTES = frozenset(vars(torch.nn.Module()))
-# Packages whose classes are identified by their names.
-_PACKAGES = sys.stdlib_module_names | {"pinn_dyn", "torch", "numpy", "scipy"}
 
 
 def describe(value: object) -> Any:
     """Describe a value as JSON: an object by its class and its ``describe()`` or its attributes.
 
-    A class of this package is identified by its name, so an edited docstring leaves recordings
-    valid. The description of a class of your own includes a hash of the file that defines it.
+    A class or a function is identified by its name: a recording shows by its samples whether the
+    present code has made it (:func:`~pinn_dyn.data.cache.load_or_make`).
 
     Raises:
         TypeError: on an object that cannot be pickled; give its class a method ``describe()``.
@@ -46,7 +40,7 @@ def plain(value: object, describe_object: Callable[[Any], Any]) -> Any:
 
 def _described_object(value: Any) -> Any:
     if isinstance(value, (type, types.FunctionType)):
-        return _definition(value)
+        return value.__qualname__
     if hasattr(value, "describe"):
         settings = value.describe()
     elif isinstance(value, torch.nn.Module):
@@ -56,21 +50,4 @@ def _described_object(value: Any) -> Any:
         settings = {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
     else:
         return describe(value.__reduce_ex__(2))
-    return {"class": _definition(type(value)), **describe(settings)}
-
-
-def _definition(item: type | types.FunctionType) -> str:
-    """Return the name of a class or function, with a hash of its source if it is the user's."""
-    kinds = item.__mro__ if isinstance(item, type) else [item]
-    sources = {_source(kind) for kind in kinds if kind.__module__.split(".")[0] not in _PACKAGES}
-    if not sources:
-        return item.__qualname__
-    return f"{item.__qualname__} {hashlib.sha256(b''.join(sorted(sources))).hexdigest()[:16]}"
-
-
-def _source(item: type | types.FunctionType) -> bytes:
-    path = getattr(sys.modules.get(item.__module__), "__file__", None)
-    if path is not None and item.__module__ != "__main__":
-        return Path(path).read_bytes()
-    members = [item, *vars(item).values()]
-    return b"".join(marshal.dumps(x.__code__) for x in members if hasattr(x, "__code__"))
+    return {"class": type(value).__qualname__, **describe(settings)}

@@ -14,13 +14,13 @@ from torch import Tensor
 from pinn_dyn.data.cache import Arrays
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import DrawnMotion, RobotExcitation
-from pinn_dyn.data.simulated import RecordedSource, split_recordings
+from pinn_dyn.data.simulated import RecordedSource, split_recordings, spread_samples
 from pinn_dyn.data.source import SPLITS
 from pinn_dyn.progress import Progress
 from pinn_dyn.systems import SimulatedArm
 
 # Part of the cache key: raise it when the same description would give other numbers.
-_VERSION = 5
+_VERSION = 6
 _DRAWS = 20
 
 
@@ -125,6 +125,20 @@ class RobotSource(RecordedSource):
                 "limits of {} in each of {} draws: lower its reach, speed or amplitude",
             )
         return split_recordings(t, motions, self.counts)
+
+    def prove(self, arrays: Arrays) -> np.ndarray:
+        if not self.may_simulate:
+            return np.asarray(arrays["proof"])
+        numbers: list[np.ndarray] = []
+        for q, v, u in zip(*spread_samples(arrays), strict=True):
+            self.system.set_state(q, v)
+            numbers += self.system.step(u, self.step)
+        for k, excitation in enumerate(self.excitations):
+            plan = excitation.draw(
+                self.system, arrays["t"], [np.random.default_rng([self.seed, k])]
+            )
+            numbers += [plan.q0, plan.v0, plan.torque(0, plan.q0, plan.v0)]
+        return np.concatenate([np.ravel(x) for x in numbers])
 
     def _record(self, plan: DrawnMotion, t: np.ndarray) -> np.ndarray:
         """Record q, v and u of K motions that advance step by step together, ``(3, K, T, N)``."""

@@ -23,7 +23,9 @@ from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.systems import HasDomain
 
 # Part of the cache key: raise it when the same settings give different numbers.
-_VERSION = 3
+_VERSION = 4
+# Samples at which a recording is compared with the present robot.
+_SAMPLES = 20
 # Within limits: largest number of further draws of a motion, and draws simulated at once.
 _REDRAWS = 39
 _AT_ONCE = 3
@@ -64,6 +66,13 @@ class RecordedSource(DataSource):
         """Record all motions anew: arrays ``t`` and ``<split>_<q, v, u>``, each ``(K, T, .)``."""
 
     @abc.abstractmethod
+    def prove(self, arrays: Arrays) -> np.ndarray:
+        """Return numbers that the present robot and excitation give for a recording, ``(n,)``.
+
+        They are the motion of the robot at some recorded samples, and the first drawn motions.
+        """
+
+    @abc.abstractmethod
     def _samples(
         self, t: Tensor, q: Tensor, v: Tensor, u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -71,7 +80,7 @@ class RecordedSource(DataSource):
 
     def load(self) -> Splits:
         folder = Path(self.cache).expanduser()
-        arrays = load_or_make(folder, self.name, self.describe(), self.simulate)
+        arrays = load_or_make(folder, self.name, self.describe(), self.simulate, self.prove)
         splits: dict[str, list[Trajectory]] = {}
         for split in SPLITS:
             keys = ("t", f"{split}_q", f"{split}_v", f"{split}_u")
@@ -129,6 +138,17 @@ def split_recordings(t: np.ndarray, motions: Motions, counts: Mapping[str, int])
         for split, part in zip(counts, np.split(values, ends), strict=True):
             arrays[f"{split}_{key}"] = part
     return arrays
+
+
+def spread_samples(arrays: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, v and u ``(20, .)`` of samples that are spread over all motions."""
+    parts = []
+    for key in "qvu":
+        motions = [arrays[f"{split}_{key}"] for split in SPLITS]
+        parts.append(np.concatenate([x.reshape(-1, x.shape[-1]) for x in motions]))
+    rows = np.linspace(0, len(parts[0]) - 1, _SAMPLES).astype(int)
+    q, v, u = (x[rows] for x in parts)
+    return q, v, u
 
 
 @dataclass(frozen=True)
@@ -263,6 +283,15 @@ class SimulatedSource(RecordedSource):
         size = max(len(self._pairs("train")), self.validation + self.test)
         short = self._simulate(SPLITS[1:], self.test_duration, size)
         return {**short, **self._simulate(SPLITS[:1], self.duration, size)}  # the longer "t"
+
+    def prove(self, arrays: Arrays) -> np.ndarray:
+        q, v, u = (torch.from_numpy(x) for x in spread_samples(arrays))
+        with torch.no_grad():
+            rates = self.system.velocity_derivative(torch.cat([q, v], dim=-1), u)
+        rngs = {s: np.random.default_rng([self.seed, SPLITS.index(s)]) for s in SPLITS}
+        q0, v0, signal = self._draw(rngs)
+        inputs = signal(np.linspace(0.0, self.duration, _SAMPLES))
+        return np.concatenate([x.ravel() for x in (rates.numpy(), q0, v0, inputs)])
 
     def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
         """Simulate the trajectories of some splits in one batch, padded with copies to ``size``."""

@@ -90,6 +90,12 @@ class ConstantArrays:
         numbers: list[float | str] = values.tolist()
         return numbers
 
+    def common(self, values: Tensor) -> float | None:
+        """Return the whole number that the code may contain for all numbers of an array, if any."""
+        first = values.flatten()[0]
+        is_common = float(first).is_integer() and bool((values == first).all())
+        return first.item() if is_common else None
+
     def spread(self, text: str) -> str:
         """Return an expression as a ``real``, which it may not be if it depends on no input."""
         return text
@@ -238,10 +244,9 @@ class CFunction:
         index = index[len(index) - value.ndim :]
         index = ["0" if size == 1 else i for i, size in zip(index, value.shape, strict=True)]
         constant = operand.op == "get_attr"
-        first = value.flatten()[0] if constant else value
-        # Integers, such as zeros, follow from the structure. Other numbers may be learned.
-        if constant and float(first).is_integer() and bool((value == first).all()):
-            return self.constants.number(first.item())
+        number = self.constants.common(value) if constant else None
+        if number is not None:
+            return self.constants.number(number)
         if operand in self._inlined:
             return f"({self._expression(operand, index)})"
         return self._element(value, index, constant)

@@ -7,7 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pinn_dyn.exports.c_loop import Loop, Numbers, loop_code, traced
+from pinn_dyn.exports.c_library import QUICK, load_code
+from pinn_dyn.exports.c_loop import Loop, loop_code, traced
+from pinn_dyn.exports.live_numbers import LiveNumbers
+from pinn_dyn.exports.program import Program
 from pinn_dyn.mechanics import ContinuousPredictor
 
 
@@ -31,24 +34,13 @@ class LoopOfDraws(Loop):
         inputs: Tensor,
         h: Tensor,
     ):
-        first = _tensors(models[0])
         programs = traced(models[0], x, inputs, h)
-        numbers = _Drawn(len(models))
-        for program in programs.values():
-            tables = [
-                program.constants_with(
-                    {a.data_ptr(): b for a, b in zip(first, _tensors(model), strict=True)}
-                )
-                for model in models
-            ]
-            for node in program.graph_module.graph.find_nodes(op="get_attr"):
-                rows = torch.stack([table[node.name].flatten() for table in tables])
-                is_shared = bool(((rows == rows[:1]) | rows.isnan()).all())
-                if not is_shared:
-                    numbers.drawn[node.meta["val"].data_ptr()] = rows
-        code, values = loop_code(programs, True, numbers)
-        super().__init__(code, values)
-        self._of_models, self._trajectories = values, 0
+        every = torch.stack([_constants(programs, models[0], model) for model in models])
+        numbers = _Drawn([*programs.values()], every)
+        code = loop_code(programs, numbers, several=True)
+        self._of_models = torch.cat([every[:, numbers.index], every.new_zeros(len(every), 1)], 1)
+        self._trajectories = 0
+        super().__init__(load_code(code, QUICK), self._of_models)
 
     def __call__(
         self,
@@ -69,38 +61,24 @@ class LoopOfDraws(Loop):
         return self._values.flatten()[part.start * self._of_models.shape[-1] :]
 
 
+def _constants(
+    programs: dict[str, Program], first: ContinuousPredictor, model: ContinuousPredictor
+) -> Tensor:
+    """Return all constants of the programs of a model for the tensors of another."""
+    pairs = zip(_tensors(first), _tensors(model), strict=True)
+    tensors = {x.data_ptr(): y for x, y in pairs}
+    parts = []
+    for program in programs.values():
+        leaves = [tensors.get(x.data_ptr(), x) for x in program.constants.leaves]
+        parts.append(program.constants.with_leaves(leaves).evaluate())
+    return torch.cat(parts)
+
+
 def _tensors(model: ContinuousPredictor) -> list[Tensor]:
     return [*model.parameters(), *model.buffers()]
 
 
-class _Drawn(Numbers):
-    """Numbers that differ between trajectories are arguments. The code contains the others.
-
-    Args:
-        models: number D of models.
-
-    Attributes:
-        drawn: values of an array for all models, ``(D, n)``, by the address of its data.
-    """
+class _Drawn(LiveNumbers):
+    """Numbers that differ between trajectories."""
 
     read, address = "((real *)values)", "values + b * {}"
-
-    def __init__(self, models: int):
-        super().__init__("double")
-        self.drawn: dict[int, Tensor] = {}
-        self._models = models
-
-    def elements(self, values: Tensor) -> list[float | str]:
-        if values.data_ptr() not in self.drawn:
-            return values.tolist()
-        start = sum(x.shape[-1] for x in self.values)
-        self.values.append(self.drawn[values.data_ptr()])
-        return [f"VALUES[{start + k}]" for k in range(len(values))]
-
-    def padding(self) -> Tensor:
-        return torch.zeros(self._models, 1, dtype=torch.float64)
-
-    def _definition(self, kind: str, name: str, values: Tensor) -> str:
-        if kind != "int":
-            raise TypeError("draws of the constants have no code for networks")
-        return super()._definition(kind, name, values)

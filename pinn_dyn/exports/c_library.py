@@ -7,19 +7,16 @@ import hashlib
 import logging
 import os
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import torch
-from torch import Tensor
 
-from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.c_file import compile_c, find_compiler
-from pinn_dyn.exports.program import trace
-from pinn_dyn.exports.scalar_code import c_function
 
 log = logging.getLogger(__name__)
 
@@ -30,56 +27,6 @@ QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
 The code has 0.7 to 0.8 of its speed (benchmarks/long_rollout.py)."""
 
 _MOST_PROGRAMS = 100  # in the cache folder
-
-
-def compiled_rows(
-    function: Callable[[Tensor], Tensor], x: Tensor, key: str | None = None
-) -> Callable[[Tensor], Tensor]:
-    """Return y = f(x) for the rows of float64 tensors, in C.
-
-    The function itself is returned if there is no C compiler or no C code for an operation.
-
-    Args:
-        function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently.
-        x: example of a row, ``(n,)``.
-        key: name of the function for :func:`recall` in later processes, or None.
-    """
-    known = None if key is None else recall(key)
-    try:
-        code = _code_of_rows(function, x) if known is None else known[0]
-        library = load_code(code, ("-O3",) if key is None else QUICK)
-        (n,), (m,) = x.shape, function(x).shape
-
-        def call(values: Tensor) -> Tensor:
-            if values.shape[-1] != n or values.dtype != torch.float64 or not values.is_cpu:
-                return function(values)  # which refuses wrong shapes
-            values = values.contiguous()
-            result = values.new_empty(*values.shape[:-1], m)
-            pointers = (ctypes.c_void_p(array.data_ptr()) for array in (values, result))
-            library.rows(ctypes.c_long(result.numel() // m), *pointers)
-            return result
-
-        torch.testing.assert_close(call(x), function(x), rtol=1e-9, atol=1e-12, equal_nan=True)
-        if key is not None and known is None:
-            remember(key, code, torch.zeros(1))
-        return call
-    except Exception:  # from a head that cannot be traced, a compiler or a full disk
-        log.debug("no C code for %s", function, exc_info=True)
-        return function
-
-
-def _code_of_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> str:
-    program = trace(function, {"x": x}, ["y"])
-    constants = ConstantArrays("double")
-    lines = c_function(program, constants).lines
-    (n,), (m,) = x.shape, function(x).shape
-    code = ["typedef double real;", PRELUDE, *constants.definitions()]
-    code += ["static void row(const real *restrict x, real *restrict y)", "{", *lines, "}"]
-    code += [
-        "void rows(long count, const real *x, real *y)",
-        f"{{ for (; count > 0; count--, x += {n}, y += {m}) row(x, y); }}",
-    ]
-    return "\n".join([*code, ""])
 
 
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
@@ -112,14 +59,14 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     return loaded
 
 
-def remember(key: str, code: str, values: Tensor) -> None:
-    """Keep code and its numbers in the cache folder, for :func:`recall` in later processes."""
+def remember(key: str, content: Any) -> None:
+    """Keep tensors and plain values in the cache folder, for :func:`recall` in later processes."""
     folder = _folder()
     if not _is_safe(folder):
         return
     with suppress(OSError), TemporaryDirectory(dir=folder) as name:
         path = Path(name) / "code.pt"
-        torch.save((code, values), path)
+        torch.save(content, path)
         path.chmod(0o600)
         earlier = [*folder.glob(f"{key}-*.pt")]
         others = sorted(folder.glob("*.pt"), key=lambda x: x.stat().st_mtime)
@@ -128,12 +75,11 @@ def remember(key: str, code: str, values: Tensor) -> None:
             old.unlink(missing_ok=True)
 
 
-def recall(key: str) -> tuple[str, Tensor] | None:
-    """Return the code and the numbers that :func:`remember` has kept, if any."""
+def recall(key: str) -> Any:
+    """Return what :func:`remember` has kept, or None."""
     for path in _unchanged(key, "pt"):
         os.utime(path)  # the oldest files are deleted
-        code, values = torch.load(path, weights_only=True)
-        return code, values
+        return torch.load(path, weights_only=True)
     return None
 
 

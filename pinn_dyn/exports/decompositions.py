@@ -143,6 +143,31 @@ def _padded(x: Tensor, pads: Sequence[int], fill: float = 0.0) -> Tensor:
     return x
 
 
+def _cross(a: Tensor, b: Tensor, *, dim: int = -1) -> Tensor:
+    def turned(x: Tensor, start: int) -> Tensor:
+        return torch.cat([x.narrow(dim, start, 3 - start), x.narrow(dim, 0, start)], dim)
+
+    return turned(a, 1) * turned(b, 2) - turned(a, 2) * turned(b, 1)
+
+
+def _split(x: Tensor, size: int, dim: int = 0) -> Any:
+    starts = range(0, x.shape[dim], size)
+    return torch.split(x, [min(size, x.shape[dim] - k) for k in starts], dim)
+
+
+def _softplus(x: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
+    scaled = beta * x
+    return torch.where(scaled > threshold, x, scaled.exp().log1p() / beta)
+
+
+def _triangle(part: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def apply(x: Tensor, diagonal: int = 0) -> Tensor:
+        mask = part(torch.ones(x.shape[-2:]), diagonal).bool()
+        return torch.where(mask, x, torch.zeros((), dtype=x.dtype))
+
+    return apply
+
+
 def _remainder(x: Tensor, y: Any) -> Any:
     return x - y * (x / y).floor() if x.is_floating_point() else NotImplemented
 
@@ -152,11 +177,12 @@ def _scaled(operation: Callable[[Tensor, Any], Tensor]) -> Callable[..., Any]:
 
 
 _aten = torch.ops.aten
+# Also operations whose decompositions in PyTorch import its compiler, which takes seconds.
 DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     _aten.linalg_cholesky_ex.default: _cholesky_ex,
     _aten.cholesky_solve.default: _cholesky_solve,
     _aten._linalg_solve_ex.default: _solve_ex,
-    _aten.addmm.default: lambda bias, a, b, beta=1, alpha=1: beta * bias + alpha * (a @ b),
+    _aten.addmm.default: lambda bias, a, b, beta=1, alpha=1: beta * bias + alpha * a.mm(b),
     _aten.bmm.default: lambda a, b: (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2),
     _aten.linalg_inv_ex.default: _inverse_ex,
     _aten.linalg_qr.default: lambda A, mode="reduced": qr(A),
@@ -170,6 +196,12 @@ DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     _aten.constant_pad_nd.default: _padded,
     _aten.relu.default: lambda x: _clamp(x, 0.0),
     _aten.rsqrt.default: lambda x: x.sqrt().reciprocal(),
+    _aten.linalg_cross.default: _cross,
+    _aten.softplus.default: _softplus,
+    _aten.split.Tensor: _split,
+    _aten.tril.default: _triangle(torch.tril),
+    _aten.triu.default: _triangle(torch.triu),
+    _aten.stack.default: lambda xs, dim=0: torch.cat([x.unsqueeze(dim) for x in xs], dim),
     **dict.fromkeys((_aten.clamp.default, _aten.clamp.Tensor), _clamp),
     **dict.fromkeys((_aten.mean.default, _aten.mean.dim), _mean),
     **dict.fromkeys((_aten.ne.Scalar, _aten.ne.Tensor), lambda x, y: torch.logical_not(x == y)),

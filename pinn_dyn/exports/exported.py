@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
@@ -48,7 +48,8 @@ class ExportedFunction:
         inputs: values of each input by name, ``(200, *shape)``, float64.
         outputs: names of the outputs.
         about: units and meaning, for the file.
-        model: the model of which the function calls a part several times, or None.
+        model: the model of which the function calls a part several times, or None. The function
+            takes a copy that calls this part as ``model=``.
     """
 
     def __init__(
@@ -80,8 +81,10 @@ class ExportedFunction:
             return {self.name: self.program}
         n, m = self._model.num_coordinates, self._model.num_inputs
         example = {name: values[0] for name, values in self.inputs.items()}
-        with calling_part(self._model, *torch.zeros(2 * n + m).double().split([2 * n, m])) as part:
-            return {"part": part, self.name: trace(self.function, example, self.outputs)}
+        state, u = torch.zeros(2 * n + m).double().split([2 * n, m])
+        calling, part = calling_part(self._model, state, u)
+        function = partial(self.function, model=calling)
+        return {"part": part, self.name: trace(function, example, self.outputs)}
 
     def compare(self, call: Call, tolerance: float) -> None:
         """Compare with a function of the file.

@@ -9,16 +9,14 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from pinn_dyn.exports.c_loop import loop_of
-
-_SHARE = 0.02
-"""Time of a step of the latent state in Python, in that of a step of a mechanical system."""
+from pinn_dyn.exports.c_loop import Steps
+from pinn_dyn.exports.compiled import STATES, Compiled
 
 
 class LatentLoop(nn.Module):
     """Steps of the latent state of a model, in C for long paths in float64 without gradients.
 
-    See :class:`~.c_loop.CLoop` for the conditions of a loop.
+    See :class:`~.compiled.Compiled` for the conditions of a loop.
 
     Args:
         model: the model, whose ``latent_path(z, ends)`` it replaces in :meth:`install`.
@@ -28,6 +26,7 @@ class LatentLoop(nn.Module):
     def __init__(self, model: nn.Module, threads: PositiveInt = 1):
         super().__init__()
         self.model, self.threads = model, threads
+        self._compiled = Compiled(self)
 
     def install(self) -> None:
         """Replace the method of the model, for this object alone."""
@@ -57,8 +56,11 @@ class LatentLoop(nn.Module):
             return self._steps(z, ends)
         x = z.reshape(-1, z.shape[-1])
         rows = ends.expand(steps, *batch, -1).reshape(steps, 1, len(x), -1)
-        loop = loop_of(self, None, x, rows[0], torch.arange(steps + 1).to(z), share=_SHARE)
+        inputs, lengths = rows.movedim(2, 0), z.new_ones(steps)
+        kind = Steps(self, x, inputs[:, :STATES], lengths[:STATES])
+        loop = self._compiled.find(kind)
         if loop is None:
-            return self._steps(z, ends)
-        path = loop(x, torch.zeros_like(x), rows.movedim(2, 0), z.new_ones(steps), self.threads)
+            with self._compiled.in_python(kind):
+                return self._steps(z, ends)
+        path = loop(x, torch.zeros_like(x), inputs, lengths, self.threads)
         return torch.cat([x[:, None], path], dim=1).reshape(*batch, steps + 1, -1).unbind(-2)

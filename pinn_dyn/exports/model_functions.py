@@ -42,10 +42,10 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
     def exported(
         function: Callable[..., Outputs], inputs: str, outputs: str, about: str
     ) -> ExportedFunction:
-        def of_present_inputs(*values: Tensor) -> Outputs:
+        def of_present_inputs(*values: Tensor, **copy: Any) -> Outputs:
             arguments = dict(zip(names, values, strict=True))
             none = {x: values[0].new_zeros(0) for x in inputs.split() if x not in names}
-            result = function(**arguments, **none)
+            result = function(**arguments, **none, **copy)
             return result if isinstance(result, Tensor) else tuple(x for x in result if x.numel())
 
         names = [x for x in inputs.split() if sizes[x] != 0]
@@ -58,7 +58,9 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
         assert isinstance(model, ContinuousPredictor)
         return model.state_derivative(torch.cat([q, v]), u)[n:]
 
-    def step(q: Tensor, v: Tensor, u: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+    def step(
+        q: Tensor, v: Tensor, u: Tensor, h: Tensor, model: Predictor = model
+    ) -> tuple[Tensor, Tensor]:
         assert isinstance(model, ContinuousPredictor)
         return held_step(model, q, v, u, h)
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import contextlib
+import copy
+import operator
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
 from torch import Tensor, fx
 from torch._decomp import core_aten_decompositions, get_decompositions
-from torch._guards import TracingContext, tracing
-from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
 
 from pinn_dyn.exports.decompositions import DECOMPOSITIONS
+from pinn_dyn.mechanics.compilation import Wrapped
 from pinn_dyn.mechanics.integrators import Sticking
 
 MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
@@ -27,6 +32,66 @@ _OF_SHAPES_ALONE = (
 )
 
 
+class Constants:
+    """Numbers of a program that follow from tensors of the model alone.
+
+    Attributes:
+        leaves: tensors that the operations read.
+        operations: function in :data:`torch.ops.aten`, arguments and options, where ``"%k"`` is
+            leaf k, or the result of an operation, counted after the last leaf.
+        results: which of these the program reads.
+    """
+
+    def __init__(
+        self, leaves: Sequence[Tensor], operations: Sequence[Sequence[Any]], results: Sequence[int]
+    ):
+        self.leaves, self.operations, self.results = [*leaves], [*operations], [*results]
+
+    def evaluate(self) -> Tensor:
+        """Return all numbers that the program reads one after the other, ``(n,)``, float64."""
+        values: list[Any] = [*self.leaves]
+        with torch.no_grad():
+            for function, arguments, options in self.operations:
+                values.append(function(*_replaced(arguments, values), **_replaced(options, values)))
+            arrays = [values[k].detach().flatten().double() for k in self.results]
+        return torch.cat([torch.zeros(0, dtype=torch.float64), *arrays])
+
+    def with_leaves(self, leaves: Sequence[Tensor]) -> Constants:
+        """Return the same operations on other leaves."""
+        return Constants(leaves, self.operations, self.results)
+
+    def packed(self) -> list[Any]:
+        """Return the operations and results without the leaves, as plain values."""
+        names = [getattr(item[0], "name", lambda: "getitem")() for item in self.operations]
+        steps = [[name, *item[1:]] for name, item in zip(names, self.operations, strict=True)]
+        return [steps, self.results]
+
+    @classmethod
+    def unpacked(cls, packed: Sequence[Any], leaves: Sequence[Tensor]) -> Constants:
+        """Return the constants of :meth:`packed` operations with other leaves."""
+        steps, results = packed
+        return cls(leaves, [[_function(name), *rest] for name, *rest in steps], results)
+
+
+def _function(name: str) -> Any:
+    """Return an operation of PyTorch by its name, such as ``aten::add.Tensor``."""
+    if name == "getitem":
+        return operator.getitem
+    packet, _, overload = name.removeprefix("aten::").partition(".")
+    return getattr(getattr(torch.ops.aten, packet), overload or "default")
+
+
+def _replaced(item: Any, values: Any) -> Any:
+    """Return arguments with the values of their references."""
+    if isinstance(item, str) and item.startswith("%"):
+        return values[int(item[1:])]
+    if isinstance(item, (list, tuple)):
+        return [_replaced(x, values) for x in item]
+    if isinstance(item, Mapping):
+        return {key: _replaced(x, values) for key, x in item.items()}
+    return item
+
+
 class Program:
     """The operations of a function for one state, without control flow and random numbers.
 
@@ -37,7 +102,7 @@ class Program:
     Attributes:
         graph_module: the operations, by name in :data:`torch.ops.aten`.
         inputs, outputs: shape of each input and output by its name, in the order of the function.
-        constants: the evaluation of the stored constants, with the tensors that the function reads.
+        constants: evaluation of the stored constants, from the tensors that the function reads.
     """
 
     def __init__(
@@ -45,7 +110,7 @@ class Program:
         graph_module: fx.GraphModule,
         inputs: Mapping[str, torch.Size],
         outputs: Mapping[str, torch.Size],
-        constants: fx.GraphModule,
+        constants: Constants,
     ):
         self.graph_module, self.constants = graph_module, constants
         self.inputs, self.outputs = dict(inputs), dict(outputs)
@@ -54,18 +119,10 @@ class Program:
         """Return the outputs in eager PyTorch."""
         return self.graph_module(*arguments)
 
-    def constants_with(self, tensors: Mapping[int, Tensor]) -> dict[str, Tensor]:
-        """Return the constants by the names of their nodes, if the function reads other tensors.
-
-        Args:
-            tensors: the other tensor for the address of the data of a tensor.
-        """
-        read = dict(self.constants.named_buffers()) | dict(self.constants.named_parameters())
-        with torch.no_grad():
-            result: dict[str, Tensor] = torch.func.functional_call(
-                self.constants, {k: tensors.get(x.data_ptr(), x) for k, x in read.items()}, ()
-            )
-        return result
+    def stored(self) -> list[Tensor]:
+        """Return the stored constants, in the order of the results of ``constants``."""
+        nodes = self.graph_module.graph.find_nodes(op="get_attr")
+        return [node.meta["val"] for node in nodes]
 
     def results(self) -> list[fx.Node]:
         """Return the nodes of the outputs."""
@@ -104,8 +161,7 @@ def moved(node: fx.Node) -> tuple[list[fx.Node], Any]:
 
 def unsupported(node: fx.Node, form: str) -> TypeError:
     """Return the error for an operation that an export does not have, with its line of code."""
-    trace = (node.meta.get("stack_trace") or "").strip().split("\n")[0]
-    line = f", {trace[0].lower() + trace[1:]}" if trace else ""
+    line = f", {node.meta['line']}" if node.meta.get("line") else ""
     return TypeError(
         f"{node.target}{line}: {form} has no such operation, write the head with others"
     )
@@ -115,15 +171,18 @@ def trace(
     function: Callable[..., Tensor | tuple[Tensor, ...]],
     inputs: Mapping[str, Tensor],
     outputs: Sequence[str],
-    lines: bool = True,
 ) -> Program:
     """Record a function at example inputs, without a batch dimension, in float64.
+
+    The function runs once, on numbers. Operations are recorded by a mode of this thread.
 
     Args:
         function: takes the inputs by position, and returns a tensor for each output.
         inputs: example value of each input by its name.
         outputs: names of the outputs.
-        lines: record the lines of code, for messages.
+
+    Raises:
+        TypeError: if Python reads a number that depends on an input, as in a branch.
     """
 
     def run(*arguments: Tensor) -> tuple[Tensor, ...]:
@@ -131,37 +190,204 @@ def trace(
             result = function(*arguments)
         return (result,) if isinstance(result, Tensor) else tuple(result)
 
-    softmax = get_decompositions([torch.ops.aten._softmax])
-    table = {**core_aten_decompositions(), **softmax, **DECOMPOSITIONS}
-    values = tuple(value.clone() for value in inputs.values())  # make_fx merges equal tensors
-    with tracing(TracingContext(FakeTensorMode())):  # else make_fx creates a mode for every node
-        traced = make_fx(torch.func.functionalize(run), table, record_stack_traces=lines)
-        module = traced(*values)
-    constants = _fold_constants(module, values)
-    results = module(*values)
+    values = tuple(value.detach().clone() for value in inputs.values())
+    recorder = _Recorder(dict(zip(inputs, values, strict=True)))
+    with recorder:
+        results = torch.func.functionalize(run)(*values)
     shapes = {name: value.shape for name, value in zip(outputs, results, strict=True)}
     sizes = {name: value.shape for name, value in inputs.items()}
+    module, constants = recorder.finished(results)
     return Program(module, sizes, shapes, constants)
 
 
-@torch.library.custom_op("pinn_dyn::call", mutates_args=())
-def _call(name: str, size: int, arguments: list[Tensor]) -> Tensor:
-    """Stand for a call of a function with one result in a program."""
+_RULES: dict[Any, Callable[..., Any]] = {
+    **core_aten_decompositions(),
+    **get_decompositions([torch.ops.aten._softmax]),
+}
+_RULES = {
+    x: y for x, y in _RULES.items() if x._schema.name.removeprefix("aten::") not in MOVES.split()
+}
+_RULES |= DECOMPOSITIONS
+_CHECKS = (torch.ops.aten._linalg_check_errors.default, torch.ops.aten.is_same_size.default)
+
+
+class _Recorder(TorchDispatchMode):
+    """Mode that records the operations on inputs, and those on constants alone beside them.
+
+    Args:
+        inputs: value of each input by name.
+    """
+
+    def __init__(self, inputs: Mapping[str, Tensor]):
+        super().__init__()
+        self._graph = fx.Graph()
+        self._stored: dict[int, fx.Node] = {}
+        self._nodes: dict[int, fx.Node] = {}
+        self._numbers: dict[int, int] = {}
+        self._constants: list[Tensor | tuple[Any, Any, Any]] = []
+        self._kept: list[Any] = []  # an address names a tensor for as long as the tensor lives
+        for name, value in inputs.items():
+            self._keep(value, self._graph.placeholder(name))
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # else PyTorch imports its compiler, which takes three seconds
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        options = kwargs or {}
+        if function in _CHECKS:
+            return function(*args, **options)
+        if not any(id(x) in self._nodes for x in tree_leaves((args, options))):
+            result = function(*args, **options)
+            self._fold(function, args, options, result)
+            return result
+        for rule in (_RULES.get(function), function.decompose):
+            if rule is not None:
+                with self:
+                    result = rule(*args, **options)
+                if result is not NotImplemented:
+                    return result
+        result = function(*args, **options)
+        self._record(function, args, options, result)
+        return result
+
+    def _record(self, function: Any, args: Any, options: Any, result: Any) -> None:
+        """Record an operation on an input."""
+        if function in _OF_SHAPES_ALONE:
+            self._leaf(result)
+            return
+        if function is torch.ops.aten.squeeze_.dim:
+            function = torch.ops.aten.squeeze.dim
+        values = tree_leaves(result)
+        if function._schema.is_mutable or not all(isinstance(x, Tensor) for x in values):
+            raise TypeError(f"{function} on a number that depends on an input cannot be recorded")
+        arguments, named = tree_map(self._operand, (tuple(args), dict(options)))
+        node = self._graph.call_function(function, arguments, named)
+        node.meta["line"] = _line_of_code()
+        if isinstance(result, Tensor):
+            self._keep(result, node)
+            return
+        node.meta["val"] = result
+        for k, value in enumerate(result):
+            self._keep(value, self._graph.call_function(operator.getitem, (node, k)))
+
+    def _keep(self, value: Tensor, node: fx.Node) -> None:
+        self._kept.append(value)
+        self._nodes[id(value)] = node
+        node.meta["val"] = value.detach()
+
+    def _operand(self, value: Any) -> Any:
+        """Return the node of a tensor."""
+        if not isinstance(value, Tensor):
+            return value
+        return self._nodes.get(id(value)) or self._stored_node(value)
+
+    def _stored_node(self, value: Tensor) -> fx.Node:
+        number = self._number(value)
+        if number not in self._stored:
+            node = self._graph.get_attr(f"constant_{number}")
+            node.meta["val"] = value.detach().clone().contiguous()
+            self._stored[number] = node
+        return self._stored[number]
+
+    def _fold(self, function: Any, args: Any, options: Any, result: Any) -> None:
+        """Record an operation on constants."""
+        values = tree_leaves(result)
+        if not all(isinstance(x, Tensor) for x in values):
+            return
+        reference = tree_map(
+            lambda x: f"%{self._number(x)}" if isinstance(x, Tensor) else x, (args, options)
+        )
+        self._add((function, *reference), result)
+        if not isinstance(result, Tensor):
+            parent = f"%{len(self._constants) - 1}"
+            for k, value in enumerate(result):
+                self._add((operator.getitem, (parent, k), {}), value)
+
+    def _leaf(self, value: Tensor) -> None:
+        self._add(value, value)
+
+    def _number(self, value: Tensor) -> int:
+        """Return the number of a constant. A tensor that no operation has made is a leaf."""
+        if id(value) not in self._numbers:
+            self._leaf(value)
+        return self._numbers[id(value)]
+
+    def _add(self, entry: Tensor | tuple[Any, Any, Any], value: Any) -> None:
+        self._kept.append(value)
+        self._numbers[id(value)] = len(self._constants)
+        self._constants.append(entry)
+
+    def finished(self, results: Sequence[Tensor]) -> tuple[fx.GraphModule, Constants]:
+        """Return the graph with these results, and the evaluation of its constants."""
+        output = self._graph.output([self._operand(x) for x in results])
+        output.meta["val"] = [*results]
+        self._graph.eliminate_dead_code()
+        stored = self._graph.find_nodes(op="get_attr")
+        values = {node.target: node.meta["val"] for node in stored}
+        module = fx.GraphModule(values, self._graph)
+        return module, self._needed([int(x.target.removeprefix("constant_")) for x in stored])
+
+    def _needed(self, results: Sequence[int]) -> Constants:
+        """Return the constants that some of them follow from, the leaves first."""
+        needed = set(results)
+        for k in reversed(range(len(self._constants))):
+            entry = self._constants[k]
+            if k in needed and not isinstance(entry, Tensor):
+                references = (x for x in tree_leaves(entry[1:]) if isinstance(x, str))
+                needed |= {int(x[1:]) for x in references if x.startswith("%")}
+        entries = {k: self._constants[k] for k in sorted(needed)}
+        leaves = {k: x for k, x in entries.items() if isinstance(x, Tensor)}
+        others = {k: x for k, x in entries.items() if not isinstance(x, Tensor)}
+        order = {k: place for place, k in enumerate([*leaves, *others])}
+        names = {k: f"%{place}" for k, place in order.items()}
+        operations = [_replaced(x, names) for x in others.values()]
+        return Constants([*leaves.values()], operations, [order[k] for k in results])
+
+
+def _line_of_code() -> str:
+    """Return the innermost line of code outside PyTorch and the exports."""
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None and frame.f_code.co_filename.startswith(_FOLDERS):
+        frame = frame.f_back
+    if frame is None:
+        return ""
+    return f'file "{frame.f_code.co_filename}", line {frame.f_lineno}, in {frame.f_code.co_name}'
+
+
+_FOLDERS = (str(Path(torch.__file__).parent), str(Path(__file__).parent), contextlib.__file__)
+
+
+def _called(name: str, size: int, arguments: list[Tensor]) -> Tensor:
     return arguments[0].new_ones(size)
 
 
-@contextmanager
-def calling_part(model: Any, state: Tensor, u: Tensor) -> Iterator[Program]:
-    """Let programs call the part of a model that the stages of a step share, within a context.
+# torch.library.custom_op would import the compiler of PyTorch, which takes three seconds.
+if not hasattr(torch.ops.pinn_dyn, "call"):  # a module that is imported again
+    _LIBRARY = torch.library.Library("pinn_dyn", "DEF")
+    _LIBRARY.define("call(str name, int size, Tensor[] arguments) -> Tensor")
+    _LIBRARY.impl("call", _called, "CompositeExplicitAutograd")
+_call = torch.ops.pinn_dyn.call
+"""Operation that stands for a call of a function with one result in a program."""
 
-    It is the mass matrix and the bias force of a system with sticking friction, in one array, or
-    the state derivative of another model.
+
+def calling_part(model: Any, state: Tensor, u: Tensor) -> tuple[Any, Program]:
+    """Return a copy of a model whose programs call a part, and the program of the part.
+
+    The stages of a step share the part. It is the mass matrix and the bias force of a system with
+    sticking friction, in one array, or the state derivative of another model. The copy has the
+    tensors of the model.
 
     Args:
         model: a continuous predictor.
         state, u: example of a state ``(S,)`` and an input ``(M,)``.
     """
-    is_sticking = isinstance(model.integrator, Sticking)
+    integrator = model.integrator
+    while isinstance(integrator, Wrapped):
+        integrator = integrator.inner
+    is_sticking = isinstance(integrator, Sticking)
     name = "_mass_and_bias" if is_sticking else "state_derivative"
     original, n = getattr(model, name), len(state) // 2
     inputs = {"x": state[:n], "y": state[n:]} if is_sticking else {"x": state, "y": u}
@@ -177,68 +403,6 @@ def calling_part(model: Any, state: Tensor, u: Tensor) -> Iterator[Program]:
         result = _call("part", size, [x.contiguous(), y.contiguous()])
         return (result[: n * n].reshape(n, n), result[n * n :]) if is_sticking else result
 
-    program = trace(part, inputs, ["result"], lines=False)
-    setattr(model, name, replacement)
-    try:
-        yield program
-    finally:
-        vars(model).pop(name, None)
-
-
-class _Values(fx.Interpreter):
-    """Interpreter that stores the value of each node, and whether it depends on an input."""
-
-    def run_node(self, node: fx.Node) -> Any:
-        value = super().run_node(node)
-        node.meta["val"] = value
-        node.meta["constant"] = node.op == "get_attr" or (
-            node.op == "call_function"
-            and (
-                node.target in _OF_SHAPES_ALONE
-                or all(x.meta["constant"] for x in node.all_input_nodes)
-            )
-        )
-        return value
-
-
-def _fold_constants(module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> fx.GraphModule:
-    """Store the constants of a graph; return their evaluation."""
-    graph = module.graph
-    for node in graph.nodes:
-        if node.target is torch.ops.aten.squeeze_.dim:
-            node.target = torch.ops.aten.squeeze.dim
-        elif node.target is torch.ops.aten._linalg_check_errors.default:
-            graph.erase_node(node)
-    graph.eliminate_dead_code()
-    _Values(module).run(*arguments)
-    evaluation = fx.Graph(module)
-    copies: dict[fx.Node, fx.Node] = {}
-    for node in graph.nodes:
-        if not node.meta.get("constant"):
-            continue
-        if all(x in copies for x in node.all_input_nodes):
-            copies[node] = evaluation.node_copy(node, copies.__getitem__)
-        else:  # of the shape of an input alone
-            name = f"shaped_{node.name}"
-            module.register_buffer(name, node.meta["val"].detach().clone())
-            copies[node] = evaluation.get_attr(name)
-    stored = {}
-    for node in list(graph.nodes):
-        if node.op != "call_function" or not node.meta["constant"]:
-            continue
-        value = node.meta["val"]
-        if isinstance(value, Tensor) and not all(user.meta["constant"] for user in node.users):
-            name = f"constant_{node.name}"
-            module.register_buffer(name, value.detach().clone().contiguous())
-            with graph.inserting_before(node):
-                replacement = graph.get_attr(name)
-            node.replace_all_uses_with(replacement)
-            stored[replacement.name] = copies[node]
-    stored |= {x.name: copies[x] for x in graph.find_nodes(op="get_attr") if x in copies}
-    graph.eliminate_dead_code()
-    evaluation.output(stored)
-    evaluation.eliminate_dead_code()
-    constants = fx.GraphModule(module, evaluation)
-    module.recompile()
-    _Values(module).run(*arguments)
-    return constants
+    calling = copy.copy(model)
+    vars(calling).update({name: replacement, "integrator": integrator})
+    return calling, trace(part, inputs, ["result"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,8 +24,9 @@ from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import VALIDATION_ERROR
 from pinn_dyn.evaluation.prediction import model_for_rollouts
-from pinn_dyn.exports.c_loop import rows_in_c, versions_of
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.exports.exported import Real
+from pinn_dyn.exports.watch import Watch
 from pinn_dyn.identification.adaptation import Adaptation, Constant, adapted_constants
 from pinn_dyn.identification.payload import identify_payload
 from pinn_dyn.mechanics import (
@@ -88,7 +89,7 @@ class Run:
     _made_in_python: DataSource | None = None
     _temporary: TemporaryDirectory[str] | None = None
     _may_simulate: bool = True
-    _rollouts: dict[str, Any] = field(default_factory=dict, init=False)
+    _copies: dict[int, tuple[Watch, Predictor]] = field(default_factory=dict, init=False)
 
     def __repr__(self) -> str:
         name, data = self.config["model_name"], self.config["dataset"].get("name")
@@ -407,13 +408,30 @@ class Run:
         return (mean - reach).numpy(), (mean + reach).numpy()
 
     def _for_rollouts(self, threads: int = 1) -> Predictor:
-        """Return the model with loops in C, copied once for the present weights."""
-        state = [threads, *versions_of(self.model)]
-        if self._rollouts.get("state") != state:
+        """Return the model with loops in C, copied once for its present numbers and attributes."""
+        watch, model = self._copies.get(threads, (None, self.model))
+        if watch is None or watch.changed():
+            watch = Watch(self.model)
             model = model_for_rollouts(self.model, threads=threads)
-            self._rollouts.clear()
-            self._rollouts.update(state=state, model=model)
-        return self._rollouts["model"]
+            self._copies[threads] = watch, model
+        return model
+
+    @cached_property
+    def _compiled(self) -> Compiled:
+        return Compiled(self.model)
+
+    def _rows(self, name: str, function: Callable[..., Tensor], *parts: Tensor) -> Tensor:
+        """Return a function of states and inputs ``(*batch, n)``, in C if that pays off."""
+        if any(x.ndim > 1 for x in parts):  # not for a single state, where it takes long
+            batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
+            parts = tuple(x.expand(*batch, -1) for x in parts)
+        sizes = [x.shape[-1] for x in parts]
+
+        def of_rows(rows: Tensor) -> Tensor:
+            return function(*rows.split(sizes, dim=-1))
+
+        with torch.no_grad():
+            return self._compiled.rows(name, of_rows, torch.cat(parts, dim=-1))
 
     def _motion(
         self, start: Values, u: Values | None, t: Values | None
@@ -440,16 +458,29 @@ class Run:
         if not isinstance(self.model, MechanicalSystem):
             kind = "an ensemble" if isinstance(self.model, Ensemble) else "a black box"
             raise TypeError(f"the model is {kind} and has no terms M, D, G and A")
-        self.model.labels, self.model.input_labels = self.labels, self.input_labels
+        labels = self.labels, self.input_labels
+        if (self.model.labels, self.model.input_labels) != labels:
+            self.model.labels, self.model.input_labels = labels
         return self.model
 
     def terms(self, q: Values) -> TermArrays:
         """Return M, D ``(*batch, N, N)``, G ``(*batch, N)`` and A ``(*batch, N, M)`` at q."""
-        return TermArrays(*(x.numpy() for x in self.system.terms(self._coordinates("q", q))))
+        system, N, M = self.system, self.model.num_coordinates, self.model.num_inputs
+
+        def function(q: Tensor) -> Tensor:
+            mass, damping, force, inputs = system.terms(q)
+            parts = mass.flatten(-2), damping.flatten(-2), force, inputs.flatten(-2)
+            return torch.cat(parts, dim=-1)
+
+        rows = self._rows("terms", function, self._coordinates("q", q))
+        mass, damping, force, inputs = rows.split([N * N, N * N, N, N * M], dim=-1)
+        shapes = (mass, (N, N)), (damping, (N, N)), (force, (N,)), (inputs, (N, M))
+        return TermArrays(*(x.reshape(*x.shape[:-1], *shape).numpy() for x, shape in shapes))
 
     def inverse_dynamics(self, q: Values, v: Values, a: Values) -> np.ndarray:
         """Return tau = M a + C v + G + D v + F, generalized forces ``(*batch, N)``."""
-        return self.system.inverse_dynamics(*self._motion_state(q=q, v=v, a=a)).numpy()
+        parts = [self._coordinates(*item) for item in (("q", q), ("v", v), ("a", a))]
+        return self._rows("inverse_dynamics", self.system.inverse_dynamics, *parts).numpy()
 
     def input_for(self, q: Values, v: Values, a: Values) -> np.ndarray:
         """Return u with A(q) u = tau, see :meth:`MechanicalSystem.input_for`, ``(*batch, M)``."""
@@ -459,25 +490,7 @@ class Run:
         """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``."""
         parts = [self._coordinates("q", q), self._coordinates("v", v)]
         parts.append(self._array("u", u, self.model.num_inputs, "M"))
-        if any(x.ndim > 1 for x in parts):  # not for a single state, where it takes long
-            batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
-            parts = [x.expand(*batch, -1) for x in parts]
-        rows = torch.cat(parts, dim=-1)
-        is_system = isinstance(self.model, MechanicalSystem)
-        model: Any = self._for_rollouts() if is_system else self.system
-        sizes = [x.shape[-1] for x in parts]
-
-        def function(x: Tensor) -> Tensor:
-            acceleration: Tensor = model.forward_dynamics(*x.split(sizes, dim=-1))
-            return acceleration
-
-        compute = self._rollouts.get("forward_dynamics")
-        with torch.no_grad():
-            if compute is None:
-                compute = rows_in_c(model, "forward_dynamics", function, rows)
-            if compute is not function:
-                self._rollouts["forward_dynamics"] = compute
-            return compute(rows).numpy()
+        return self._rows("forward_dynamics", self.system.forward_dynamics, *parts).numpy()
 
     def linearize(
         self, q: Values, v: Values, u: Values, *, sample_time: float | None = None

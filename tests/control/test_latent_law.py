@@ -18,11 +18,11 @@ from pinn_dyn.control import (
 from pinn_dyn.control.contracts import Motion, Plant, Reference
 from pinn_dyn.control.latent_plan import LatentMechanics
 from pinn_dyn.control.safe_law import SafeLaw
-from pinn_dyn.exports import c_loop
 from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.testing import LinearSystem, damped_oscillators
 from tests.models.builders import STEP, make_statistics
 from tests.support.c_code import function_of
+from tests.support.code_in_c import build_at_once, codes
 
 
 def make_oscillators(output):
@@ -219,9 +219,7 @@ def test_the_law_keeps_the_limits_without_winding_up(model):
 def test_the_file_in_c_gives_the_inputs_of_the_loop(model, tmp_path, monkeypatch):
     """A closed loop with a wrong model, limits and a dead time; and rows in C in the loop."""
     low, high = ((model.mean[-2:] + s * model.std[-2:]).tolist() for s in (-0.4, 0.5))
-    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
-    monkeypatch.setattr(c_loop, "STEPS", 5)
-    monkeypatch.setattr(c_loop, "_ROWS", {})
+    build_at_once(monkeypatch, tmp_path)
     law = LatentLaw(
         *(model, 0.5, 0.5 * STEP, 0.2 / STEP),
         dead_time=1.5 * STEP,
@@ -242,8 +240,7 @@ def test_the_file_in_c_gives_the_inputs_of_the_loop(model, tmp_path, monkeypatch
         statuses.add(status)
         q, _ = plant.advance(u, STEP)
     assert statuses == {0, 1}
-    assert len(c_loop._ROWS) == 1
-    assert law._row not in c_loop._ROWS.values()
+    assert len(codes()) == 1
     u, after, status = call(*(x.numpy() for x in (torch.nan * q[0], zero[0], *motion)), memory)
     np.testing.assert_array_equal(u, found)
     np.testing.assert_array_equal(after[-law.memory_size :], memory[-law.memory_size :])

@@ -1,8 +1,6 @@
 """Identity of data, and the description that is the key of a simulation in the cache."""
 
-import itertools
 import json
-import sys
 
 import pytest
 import torch
@@ -107,44 +105,6 @@ def test_stored_data_have_the_identity_of_their_source(tmp_path):
 
 
 # Description of a simulation.
-
-MODULE = """
-class Pendulum:
-    def __init__(self, masses=(1.0, 2.0)):
-        self.masses = list(masses)
-
-    def inertia(self):
-        return sum(self.masses) * 0.3**2
-"""
-names = (f"pendulum_of_test_{k}" for k in itertools.count())
-
-
-def pendulum(tmp_path, monkeypatch, text=MODULE, **arguments):
-    """The description of a user's system, imported as a new process would import it."""
-    folder = tmp_path / next(names)
-    folder.mkdir()
-    (folder / "my_pendulum.py").write_text(text)
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.delitem(sys.modules, "my_pendulum", raising=False)
-    import my_pendulum
-
-    return json.dumps(describe(my_pendulum.Pendulum(**arguments)))
-
-
-def test_an_edited_file_of_the_user_is_another_system(tmp_path, monkeypatch):
-    before = pendulum(tmp_path, monkeypatch)
-    assert pendulum(tmp_path, monkeypatch) == before
-    assert pendulum(tmp_path, monkeypatch, MODULE.replace("0.3**2", "0.3**3")) != before
-    assert pendulum(tmp_path, monkeypatch, masses=[1.0, 2.5]) != before
-
-
-def test_a_class_of_a_session_is_known_by_its_methods():
-    def spring(factor):
-        scope = {"__name__": "__main__"}
-        exec(f"class Spring:\n    def force(self, q):\n        return {factor} * q\n", scope)
-        return describe(scope["Spring"]())
-
-    assert spring(2.0) == spring(2.0) != spring(3.0)
 
 
 def test_our_own_robots_are_described_by_their_settings():

@@ -2,21 +2,26 @@
 
 import importlib
 import logging
+import re
 import sys
-from collections import Counter
+import threading
 from functools import partial
 
 import pytest
 import torch
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.prediction import model_for_rollouts
-from pinn_dyn.exports import c_code, c_library, c_loop
+from pinn_dyn.exports import c_code, c_library, c_loop, compiled
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
+from pinn_dyn.mechanics.compilation import integrated_by
 from pinn_dyn.models import Servo
 from pinn_dyn.testing import LinearSystem
 from tests.models.builders import VARIANTS, make_model, make_structured, perturb
 from tests.support.arm_urdf import ARM
+from tests.support.code_in_c import build_at_once, codes, next_process
 from tests.support.known import elastic_model, known_model
 
 NETWORK = VARIANTS["constant-mass-fixed-damping-constant-input-3x3"]
@@ -25,11 +30,7 @@ NETWORK = VARIANTS["constant-mass-fixed-damping-constant-input-3x3"]
 @pytest.fixture(autouse=True)
 def cached(monkeypatch, tmp_path):
     """Loops for paths of any length, compiled quickly, in a cache folder of the test."""
-    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
-    monkeypatch.setattr(c_loop, "STEPS", 1)
-    monkeypatch.setattr(c_loop, "QUICK", ("-O0",))
-    monkeypatch.setattr(c_loop, "_LOOPS", {})
-    monkeypatch.setattr(c_loop, "_WITHOUT", Counter())
+    build_at_once(monkeypatch, tmp_path)
     return tmp_path
 
 
@@ -79,7 +80,7 @@ def rolled_out(model, batch=(), count=80, interpolation="linear", scale=1.0):
 def test_the_loop_gives_the_states_of_the_model(kind, batch):
     interpolation = {"known": "hold", "rosenbrock": "cubic"}.get(kind, "linear")
     found, expected = rolled_out(MODELS[kind](), batch, interpolation=interpolation)
-    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop.Loop]
+    assert len(codes()) == 1
     assert (expected[..., -1, :] - expected[..., 0, :]).abs().max() > 1e-3
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
@@ -96,7 +97,7 @@ def test_the_loop_of_a_latent_state_gives_the_states_of_the_model(kind, batch):
     with torch.no_grad():
         found = model_for_rollouts(model, threads=2).predict(x0, t, Signal(t, u))
         expected = model.predict(x0, t, Signal(t, u))
-    assert next(iter(c_loop._LOOPS.values())) is not None
+    assert len(codes()) == 1
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
@@ -113,7 +114,7 @@ def test_trajectories_side_by_side_do_not_mix_and_threads_share_them(monkeypatch
     assert together[0].eq(0).all()
     assert not together[1:, -1].isfinite().any()
     torch.testing.assert_close(together, torch.stack(alone), rtol=1e-9, atol=0, equal_nan=True)
-    assert len(c_loop._LOOPS) == 2
+    assert len(codes()) == 2
 
 
 @pytest.mark.parametrize("kind", ["momentum", "ensemble", "passive"])
@@ -135,81 +136,173 @@ def test_long_paths_are_computed_in_blocks_and_end_where_one_diverges(monkeypatc
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=0, equal_nan=True)
 
 
-def test_models_of_one_kind_share_the_compiled_code_but_not_its_numbers(cached):
-    """Neither a change of the numbers nor an earlier program leaves a loop of old ones."""
-    model = make_structured("lnn", **NETWORK)
-    before, _ = rolled_out(model)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.data.mul_(1.1)
-    found, expected = rolled_out(model)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
-    assert (found - before).abs().max() > 1e-4
-    assert len(c_loop._LOOPS) == 2
-    assert len([*cached.glob("compiled/*.so")]) == 1
-    assert len([*cached.glob("compiled/*")]) == 3  # and the numbers of both
+def changed_by_data(model):
+    for parameter in model.parameters():
+        parameter.data.mul_(1.1)
 
 
-def test_new_numbers_of_a_model_count_in_its_next_path():
+def changed_by_array(model):
+    for parameter in model.parameters():
+        parameter.detach().numpy()[...] *= 1.1
+
+
+def changed_by_vector(model):
+    vector = 1.1 * parameters_to_vector(model.parameters())
+    vector_to_parameters(vector, model.parameters())
+
+
+def changed_by_state(model):
+    model.load_state_dict({name: 1.1 * x for name, x in model.state_dict().items()}, assign=True)
+
+
+@pytest.mark.parametrize(
+    "change", [changed_by_data, changed_by_array, changed_by_vector, changed_by_state]
+)
+def test_new_numbers_count_in_the_next_path_and_build_nothing(monkeypatch, change):
     model = make_structured("lnn", **NETWORK).double().requires_grad_(False)
     copy, t = model_for_rollouts(model), 0.01 * torch.arange(20).double()
-    signal = Signal(t, torch.ones(20, 3).double())
-    x0 = torch.full((6,), 0.1).double()
+    signal, x0 = Signal(t, torch.ones(20, 3).double()), torch.full((6,), 0.1).double()
     with torch.no_grad():
-        copy.predict(x0, t, signal)
-        for item in (model, copy):
-            for parameter in item.parameters():
-                parameter.mul_(1.1)
+        before = copy.predict(x0, t, signal)
+        monkeypatch.setattr(c_loop, "trace", None)
+        monkeypatch.setattr(c_library, "compile_c", None)
+        change(model)
+        change(copy)
         found, expected = copy.predict(x0, t, signal), model.predict(x0, t, signal)
+    assert (found - before).abs().max() > 1e-4
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+    assert len(codes()) == 1
 
 
-def next_process(monkeypatch, count=80):
-    """Roll out in a process that has no loops yet; return its only one."""
-    c_loop._LOOPS.clear()
-    c_loop._WITHOUT.clear()
+class Link(LinearSystem):
+    """A system with numbers in all places that Python knows."""
+
+    share = 1.0
+
+    def __init__(self, *matrices):
+        super().__init__(*matrices)
+        self.force, self.table = 1.0, {"factor": [1.0]}
+        self.law = lambda q: q
+
+    def _potential_force(self, q):
+        factor = self.force * self.share * self.table["factor"][0] * FACTOR
+        return factor * self.law(super()._potential_force(q))
+
+
+FACTOR = 1.0
+CHANGES = {
+    "attribute": lambda patch, x: setattr(x, "force", 3.0),
+    "container": lambda patch, x: x.table["factor"].__setitem__(0, 3.0),
+    "function": lambda patch, x: setattr(x, "law", torch.sin),
+    "class": lambda patch, x: patch.setattr(Link, "share", 3.0),
+    "global": lambda patch, x: patch.setitem(Link._potential_force.__globals__, "FACTOR", 3.0),
+    "integrator": lambda patch, x: setattr(x, "integrator", c_loop.CLoop(Rosenbrock(2))),
+    "method": lambda patch, x: patch.setattr(Link, "_potential_force", lambda self, q: 2 * q),
+    "zero": lambda patch, x: x.damping.data.zero_(),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_attribute_or_function_counts_in_the_next_path(monkeypatch, name):
+    model = model_for_rollouts(Link([[1.0]], [[9.0]], [[0.1]], [[1.0]]))
+    t = 0.1 * torch.arange(40).double()
+    start, signal = torch.tensor([0.3, 2.0]).double(), Signal(t, torch.zeros(40, 1).double())
+    with torch.no_grad():
+        before = model.predict(start, t, signal)
+        CHANGES[name](monkeypatch, model)
+        found = model.predict(start, t, signal)
+        with integrated_by(model, model.integrator.inner):
+            expected = model.predict(start, t, signal)
+    assert (before - expected).abs().max() > 1e-6
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+    assert len(codes()) == 2
+
+
+def test_threads_see_the_model_while_another_thread_builds_its_loop(monkeypatch):
+    model = known_model(ARM, locked_joints=()).double().eval().requires_grad_(False)
+    copy, t = model_for_rollouts(model), 0.01 * torch.arange(3).double()
+    x0 = torch.full((2 * model.num_coordinates,), 0.1).double()
+    signal = Signal(t, torch.ones(3, model.num_inputs).double())
+    results, threads = [], []
+
+    def predict():
+        with torch.no_grad():
+            results.append(copy.predict(x0, t, signal))
+
+    for _ in range(2):
+        threads.append(threading.Thread(target=predict))
+        threads[-1].start()
+    while any(thread.is_alive() for thread in threads):
+        predict()
+    with torch.no_grad():
+        expected = model.predict(x0, t, signal)
+    assert len(results) > 3
+    for found in results:
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+def test_the_stages_of_a_step_call_their_common_part():
+    """The mass matrix and the bias force of a robot with dry friction stand in the code once."""
+    rolled_out(known_model())
+    (code,) = codes()
+    step = code.text[code.text.index("static void integration_step") :]
+    assert len(re.findall(r"\bpart\(", step)) == 4
+
+
+def next_states(monkeypatch, count=80):
+    """Roll out in a process that has no code yet; return the number of codes after it."""
+    next_process(monkeypatch)
     found, expected = rolled_out(MODELS["momentum"](), count=count)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
-    return next(iter(c_loop._LOOPS.values()), None)
+    return len(codes())
 
 
-def test_a_compiled_loop_serves_the_next_process(monkeypatch, cached):
+def test_code_serves_the_next_process_also_with_other_numbers(monkeypatch, cached):
     """It serves short paths, too, and is neither traced nor compiled again."""
     rolled_out(MODELS["momentum"]())
     monkeypatch.setattr(c_library, "compile_c", None)
-    monkeypatch.setattr(c_loop, "STEPS", 10**6)
+    monkeypatch.setattr(compiled, "BUILD_SECONDS", 1e6)
     with monkeypatch.context() as patch:
         patch.setattr(c_loop, "trace", None)
-        assert isinstance(next_process(monkeypatch, count=2), c_loop.Loop)
+        assert next_states(monkeypatch, count=2) == 1
+        next_process(monkeypatch)
+        model = MODELS["momentum"]()
+        changed_by_data(model)
+        found, expected = rolled_out(model)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+        assert len(codes()) == 1
     (known,) = cached.glob("compiled/*.pt")
     known.write_bytes(known.read_bytes()[:-1])  # cut short: not read
-    assert next_process(monkeypatch) is None
-    monkeypatch.setattr(c_loop, "STEPS", 1)
-    assert isinstance(next_process(monkeypatch), c_loop.Loop)
+    assert next_states(monkeypatch) == 0
+    monkeypatch.setattr(compiled, "BUILD_SECONDS", 0.0)
+    assert next_states(monkeypatch) == 1
     c_library._target.cache_clear()  # as for another processor
     monkeypatch.setattr(c_library, "_FLAGS", [*c_library._FLAGS, "-mtune=generic"])
-    assert next_process(monkeypatch) is None
+    assert next_states(monkeypatch) == 0
 
 
 SPRING = """
+import stiffness_of_a_user
 from pinn_dyn.testing import LinearSystem
 
 class Spring(LinearSystem):
     def _potential_force(self, q):
-        return super()._potential_force(q) + {force} * (q > 0.5)
+        return super()._potential_force(q) + stiffness_of_a_user.force(q)
 """
+STIFFNESS = "def force(q):\n    return {} * (q > 0.5)\n"
 
 
-def test_a_class_that_has_changed_gets_a_loop_of_its_own(monkeypatch, tmp_path):
-    """The change acts beyond the first step only. A class without a file gets no loop."""
+def test_a_changed_helper_module_gets_code_of_its_own(monkeypatch, tmp_path):
+    """The change acts beyond the first states only."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "springs_of_a_user.py").write_text(SPRING)
     for force in (0.0, -9.5):
-        (tmp_path / "springs_of_a_user.py").write_text(SPRING.format(force=force))
-        sys.modules.pop("springs_of_a_user", None)
+        (tmp_path / "stiffness_of_a_user.py").write_text(STIFFNESS.format(force))
+        for name in ("springs_of_a_user", "stiffness_of_a_user"):
+            sys.modules.pop(name, None)
         module = importlib.import_module("springs_of_a_user")
-        c_loop._LOOPS.clear()
-        c_loop._WITHOUT.clear()
+        next_process(monkeypatch)
         model = module.Spring([[1.0]], [[2.0]], [[0.1]], [[1.0]])
         t = 0.01 * torch.arange(100).double()
         start = torch.tensor([0.3, 2.0]).double()
@@ -219,28 +312,24 @@ def test_a_class_that_has_changed_gets_a_loop_of_its_own(monkeypatch, tmp_path):
             expected = model.double().predict(start, t, signal)
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
         assert expected[:, 0].max() > 0.6
-        assert isinstance(*c_loop._LOOPS.values(), c_loop.Loop)
-    monkeypatch.delattr(module, "__file__")
-    c_loop._origin.cache_clear()
-    copy = model_for_rollouts(model)
-    with pytest.raises(TypeError, match="has no file"):
-        c_loop._key_of(copy, copy.integrator)
+        assert len(codes()) == 1
+    assert len([*tmp_path.glob("compiled/*.pt")]) == 2
 
 
-def test_code_of_an_earlier_class_is_replaced(monkeypatch, cached):
-    rolled_out(MODELS["momentum"]())
-    code = c_loop.LOOP.replace("lengths[k]", "2 * lengths[k]")
-    with monkeypatch.context() as patch:
-        patch.setattr(c_loop, "LOOP", code)
-        patch.setattr(torch, "allclose", lambda *_, **__: True)
-        c_loop._LOOPS.clear()
-        c_loop._WITHOUT.clear()
-        for path in cached.glob("compiled/*.pt"):
-            path.unlink()
-        rolled_out(MODELS["momentum"]())  # writes the numbers with wrong code
-    assert isinstance(next_process(monkeypatch), c_loop.Loop)
-    (known,) = cached.glob("compiled/*.pt")
-    assert "2 * lengths" not in torch.load(known, weights_only=True)[0]
+def test_code_that_disagrees_beyond_the_first_state_is_replaced(monkeypatch, cached):
+    """What a key does not see: a force that the cached code does not have, far from rest."""
+    monkeypatch.setattr(compiled.Watch, "digest", lambda self: "the same")
+    for limit in (1e6, 0.4):
+        next_process(monkeypatch)
+        model = LinearSystem([[1.0]], [[2.0]], [[0.1]], [[1.0]])
+        force = model._potential_force
+        model._potential_force = lambda q, force=force, limit=limit: torch.where(
+            q > limit, 9 * q, force(q)
+        )
+        found, expected = rolled_out(model, count=150)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+        assert len(codes()) == 1
+    assert expected[..., 0].max() > 0.4
 
 
 class Bessel(LinearSystem):
@@ -270,17 +359,17 @@ def test_without_a_loop_the_states_are_those_of_the_model(monkeypatch, cached, c
     with caplog.at_level(logging.INFO):
         found, expected = rolled_out(model)
     assert torch.equal(found, expected)
-    assert not any(c_loop._LOOPS.values())
+    assert not codes()
     assert not caplog.text
 
 
-def test_short_paths_and_gradients_do_not_build_a_loop(monkeypatch):
-    monkeypatch.setattr(c_loop, "STEPS", 100)
+def test_python_computes_until_it_has_taken_as_long_as_a_build_and_for_gradients(monkeypatch):
+    monkeypatch.setattr(compiled, "BUILD_SECONDS", 1.0)
+    ticks = iter(0.3 * k for k in range(100))
+    monkeypatch.setattr(compiled.time, "thread_time", lambda: next(ticks))
     model = make_structured("lnn", **NETWORK)
-    rolled_out(model, count=60)
-    assert not c_loop._LOOPS
-    rolled_out(model, count=60)  # together long enough
-    assert len(c_loop._LOOPS) == 1
+    built = [bool(rolled_out(model, count=20) and codes()) for _ in range(5)]
+    assert built == [False] * 4 + [True]
     copy = model_for_rollouts(model)
     x0 = torch.full((6,), 0.1).double().requires_grad_()
     t = 0.01 * torch.arange(200).double()
@@ -290,47 +379,39 @@ def test_short_paths_and_gradients_do_not_build_a_loop(monkeypatch):
 
 
 def test_rows_of_a_model_are_compiled_once_for_all_processes(monkeypatch, cached):
-    """From enough rows on, for its own numbers, and without a trace in the next process."""
+    """For its own numbers, and without a trace in the next process."""
     model = make_structured("lnn", **NETWORK).double().eval().requires_grad_(False)
     rows = torch.rand(4, 9, generator=torch.Generator().manual_seed(2)).double()
 
     def function(x):
         return model.forward_dynamics(*x.chunk(3, dim=-1))
 
-    monkeypatch.setattr(c_loop, "STEPS", 2)
-    monkeypatch.setattr(c_loop, "_ROWS", {})
-    assert c_loop.rows_in_c(model, "a", function, rows) is function
-    fast = c_loop.rows_in_c(model, "a", function, rows)
-    assert fast is not function
-    torch.testing.assert_close(fast(rows), function(rows), rtol=1e-10, atol=1e-12)
-    with pytest.raises(ValueError, match=r"shape|expected"):
-        fast(rows[:, :8])
-    c_loop._ROWS.clear()
-    c_loop._WITHOUT.clear()
-    monkeypatch.setattr(c_library, "trace", None)
-    again = c_loop.rows_in_c(model, "a", function, rows)
-    assert torch.equal(again(rows), fast(rows))
-    with torch.no_grad():
-        next(model.parameters()).add_(0.1)
-    assert c_loop.rows_in_c(model, "a", function, rows) is function
+    code = Compiled(model)
+    for _ in range(2):
+        found = code.rows("a", function, rows)
+        torch.testing.assert_close(found, function(rows), rtol=1e-10, atol=1e-12)
+        assert len(codes()) == 1
+        with pytest.raises(ValueError, match=r"shape|expected"):
+            code.rows("a", function, rows[:, :8])
+        next_process(monkeypatch)
+        monkeypatch.setattr(compiled, "trace", None)
+        with torch.no_grad():
+            next(model.parameters()).add_(0.1)
 
 
-def test_code_of_rows_is_built_at_once_for_many_expected_calls(monkeypatch):
-    monkeypatch.setattr(c_loop, "STEPS", 10**6)
-    monkeypatch.setattr(c_loop, "_ROWS", {})
-    model = make_structured("lnn", **NETWORK).double().eval().requires_grad_(False)
-    rows = torch.rand(4, 9, generator=torch.Generator().manual_seed(2)).double()
+def test_rows_are_those_of_the_function_also_where_they_are_not_finite():
+    x = 20 * torch.randn(5, 4, 3, dtype=torch.float64)
+    x[1, 2, 0], x[3, 0, 2] = torch.nan, torch.inf
+    for scale in (1.0, 0.5):
+        weights = scale * torch.rand(30, 3, dtype=torch.float64)
 
-    def function(x):
-        return model.forward_dynamics(*x.chunk(3, dim=-1))
+        def function(x, weights=weights):
+            y = torch.nn.functional.softplus(x @ weights.T)
+            return torch.tanh(y / 50) * torch.exp(-y) + torch.relu(y - 3)
 
-    def is_built(name):
-        return c_loop.rows_in_c(model, name, function, rows) is not function
-
-    with c_loop.expected_calls(1000):
-        monkeypatch.setattr(c_loop, "BUILD_SECONDS", 1e3)
-        assert not is_built("slow")
-        monkeypatch.setattr(c_loop, "BUILD_SECONDS", 1e-3)
-        assert is_built("fast")
-        assert not is_built("slow")  # the time of calls in Python was measured once
-    assert not is_built("other")
+        code = Compiled(weights)
+        found = code.rows("f", function, x)
+        torch.testing.assert_close(found, function(x), rtol=1e-12, atol=0, equal_nan=True)
+        columns = x.mT.contiguous().mT
+        torch.testing.assert_close(code.rows("f", function, columns), found, equal_nan=True)
+    assert len(codes()) == 1  # other numbers need no other code

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.exports.c_loop import Loop, loop_code, traced
 from pinn_dyn.exports.exported import ExportedFunction, write
 from pinn_dyn.exports.scalar_code import ScalarTerms
 from pinn_dyn.testing import LinearSystem
 from tests.support.c_code import compiled
+from tests.support.code_in_c import loop_of
 from tests.support.processes import fork
 
 VALUES = {"x": 0.7, "y": -1.3, "yes": True, "no": False}
@@ -95,11 +95,10 @@ def test_operations_in_vectors_are_those_of_pytorch_also_of_nan(monkeypatch, tmp
     x = (0.125 * torch.arange(-6, 7)).double()[:, None] * torch.tensor([1.0, 0.0]).double()
     inputs = torch.zeros(13, 1, 4, 1).double()[:, :, : len(model.integrator.nodes)]
     h = torch.tensor([0.1]).double()
-    programs = traced(model, x[-1], inputs[0, 0], h[0])
     end = torch.stack([model.integration_step(0 * y, y, inputs[0, 0], h[0]) for y in x])
     assert 3 < end.isfinite().all(1).sum() < 10
     for several in (False, True):
-        loop = Loop(*loop_code(programs, several))
+        loop = loop_of(model, x[-1], inputs[0, 0], h[0], several)
         found = loop(0 * x, x, inputs, h)[:, 0]
         torch.testing.assert_close(found, end, rtol=1e-12, atol=1e-12, equal_nan=True)
 
@@ -121,7 +120,7 @@ def test_lanes_without_a_trajectory_read_nothing(monkeypatch, tmp_path):
     model = LinearSystem([[1.0]], [[1.0]], [[0.1]], [[1.0]]).double()
     inputs = torch.ones(5, 3, len(model.integrator.nodes), 1).double()
     x, h = torch.ones(5, 2).double(), torch.full((3,), 0.1).double()
-    loop = Loop(*loop_code(traced(model, x[0], inputs[0, 0], h[0]), several=True))
+    loop = loop_of(model, x[0], inputs[0, 0], h[0], several=True)
     guarded = [at_the_end_of_a_page(values) for values in (0 * x, x, inputs, h)]
     with (tmp_path / "output.txt").open("w") as output:
         process = fork(lambda: loop(*guarded), output)

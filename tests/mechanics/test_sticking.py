@@ -10,7 +10,6 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from pinn_dyn.exports import c_loop
 from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
 from pinn_dyn.mechanics.compilation import Unrolled, integrated_by
@@ -18,6 +17,7 @@ from pinn_dyn.mechanics.integrators import Sticking
 from pinn_dyn.models import CoulombFriction
 from pinn_dyn.run.export import export
 from pinn_dyn.testing import LinearSystem, assert_near, partial_derivatives
+from tests.support.code_in_c import build_at_once, codes
 from tests.support.known import elastic_model, known_model
 from tests.support.rigid_chains import TREE
 
@@ -267,9 +267,7 @@ def test_friction_never_adds_energy(elastic):
 
 
 def test_loops_and_batches_equal_single_steps(monkeypatch, tmp_path):
-    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
-    monkeypatch.setattr(c_loop, "STEPS", 1)
-    monkeypatch.setattr(c_loop, "_LOOPS", {})
+    build_at_once(monkeypatch, tmp_path)
     system = two_links()
     t = torch.linspace(0, 3, 20, dtype=torch.float64)
     x0 = torch.tensor([[0.0, 0.0, 0.7, -0.4], [0.1, 0.0, 0.0, 0.0]], dtype=torch.float64)
@@ -285,7 +283,7 @@ def test_loops_and_batches_equal_single_steps(monkeypatch, tmp_path):
             with integrated_by(system, wrapper(system.integrator)):
                 path = system.predict(x0, t, both)
             torch.testing.assert_close(path, expected, rtol=0, atol=1e-12)
-    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop.Loop]
+    assert len(codes()) == 1
 
 
 @pytest.mark.parametrize("method", METHODS)

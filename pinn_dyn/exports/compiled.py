@@ -1,0 +1,337 @@
+"""A model as code in C, with the numbers and attributes that the model has at each call."""
+
+from __future__ import annotations
+
+import abc
+import ctypes
+import hashlib
+import logging
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.exports.c_code import PRELUDE
+from pinn_dyn.exports.c_file import find_compiler
+from pinn_dyn.exports.c_library import QUICK, load_code, recall, remember
+from pinn_dyn.exports.live_numbers import LiveNumbers
+from pinn_dyn.exports.program import Constants, Program, trace
+from pinn_dyn.exports.scalar_code import c_function
+from pinn_dyn.exports.watch import Watch
+
+log = logging.getLogger(__name__)
+
+BUILD_SECONDS = 1.0
+"""Processor time in Python after which code is built, about that of building it, s."""
+STATES = 20
+"""Number of states at which code is compared with Python before it is used."""
+_MOST = 64
+_TOLERANCE = 1e-9
+
+Function = Callable[..., Tensor]
+
+
+class Code(NamedTuple):
+    """Code of a kind of model, and where its numbers come from.
+
+    Attributes:
+        text: the code.
+        constants: operations and results of the constants of each program, see :class:`Constants`.
+        leaves: for each program the tensors that these read: the number of a watched tensor, or a
+            tensor that no model has.
+        order: positions of the arguments of the code among all constants, ``(n,)``.
+        places, numbers: positions of the constants that the code contains, and their values.
+    """
+
+    text: str
+    constants: list[Any]
+    leaves: list[list[int | Tensor]]
+    order: Tensor
+    places: Tensor
+    numbers: Tensor
+
+    def values(self, tensors: Sequence[Tensor]) -> Tensor | None:
+        """Return the arguments of the code, or None if the code contains other numbers.
+
+        Args:
+            tensors: the watched tensors of the model.
+        """
+        every = []
+        for packed, sources in zip(self.constants, self.leaves, strict=True):
+            leaves = [x if isinstance(x, Tensor) else tensors[x] for x in sources]
+            every.append(Constants.unpacked(packed, leaves).evaluate())
+        constants = torch.cat(every)
+        if not torch.equal(constants[self.places], self.numbers):
+            return None
+        return torch.cat([constants[self.order], constants.new_zeros(1)])  # never empty
+
+
+class Kind(abc.ABC):
+    """A way to run a function of a model in C.
+
+    Attributes:
+        name: name of the function, also of settings that are not in the model.
+        flags: optimization.
+    """
+
+    name: str
+    flags: Sequence[str] = QUICK
+
+    @abc.abstractmethod
+    def programs(self) -> dict[str, Program]:
+        """Record the function, after the parts that it calls."""
+
+    @abc.abstractmethod
+    def text(self, programs: dict[str, Program], numbers: LiveNumbers) -> str:
+        """Return the code."""
+
+    @abc.abstractmethod
+    def loaded(self, library: ctypes.CDLL, values: Tensor) -> Function:
+        """Return the function of a library."""
+
+    @abc.abstractmethod
+    def agrees(self, function: Function) -> bool:
+        """Return true if a function gives the numbers of Python at many states and inputs."""
+
+
+class Compiled:
+    """Functions of a model in C, as long as neither a number nor an attribute has changed.
+
+    Numbers come from the tensors of the model. A changed number or attribute is noticed at the next
+    call (:class:`Watch`). Code is used only after it agrees with Python at :data:`STATES` states,
+    also code from the cache folder. It is built when Python has taken :data:`BUILD_SECONDS`, unless
+    the folder has it. Python goes on where there is no C compiler or no C code for an operation,
+    and in threads that would wait for the build of another thread.
+
+    Args:
+        roots: the model, and further objects that the functions read.
+    """
+
+    is_unwatched = True
+
+    def __init__(self, *roots: Any):
+        self._roots = roots
+        self._watch: Watch | None = None
+        self._digest = ""
+        self._functions: dict[str, Function] = {}
+        self._lock = threading.Lock()
+
+    def __deepcopy__(self, memo: Any) -> None:
+        """Leave the copy of a model without code; the copy is another model."""
+
+    def __reduce__(self) -> Any:
+        return type(None), ()
+
+    def find(self, kind: Kind) -> Function | None:
+        """Return a function in C, or None where Python computes it."""
+        watch = self._watch
+        if watch is not None and not watch.changed():
+            function = self._functions.get(kind.name)
+            if function is not None:
+                return function
+        if not self._lock.acquire(blocking=False):
+            return None
+        try:
+            return self._found(kind)
+        finally:
+            self._lock.release()
+
+    def rows(self, name: str, function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
+        """Return a function of rows, in C if possible.
+
+        Args:
+            name: name of the function, which this object computes for the same roots only.
+            function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently. It
+                reads the roots alone.
+            rows: its argument.
+        """
+        if not rows.numel() or rows.dtype != torch.float64 or not rows.is_cpu:
+            return function(rows)
+        kind = _Rows(name, function, rows)
+        compiled = self.find(kind)
+        if compiled is not None:
+            return compiled(rows)
+        with self.in_python(kind):
+            return function(rows)
+
+    @contextmanager
+    def in_python(self, kind: Kind) -> Iterator[None]:
+        """Count the processor time of a context, in which Python computes a function."""
+        start = time.thread_time()
+        try:
+            yield
+        finally:
+            _SECONDS[self._key(kind)] += time.thread_time() - start
+
+    def _key(self, kind: Kind) -> str:
+        return hashlib.sha256(f"{self._digest} {kind.name}".encode()).hexdigest()
+
+    def _found(self, kind: Kind) -> Function | None:
+        if self._watch is None or self._watch.changed():
+            self._functions = {}
+            self._watch = Watch(*self._roots)
+            self._digest = self._watch.digest()
+        key = self._key(kind)
+        try:
+            function = self._known(key, kind) or self._built(key, kind)
+        except Exception:  # from a head that cannot be traced, a compiler or a full disk
+            log.debug("no code in C for %s", kind.name, exc_info=True)
+            _SECONDS[key] = -float("inf")
+            return None
+        if function is not None:
+            self._functions = {**self._functions, kind.name: function}
+        return function
+
+    def _known(self, key: str, kind: Kind) -> Function | None:
+        """Return the function of code that this process or the cache folder has."""
+        code = _CODES.get(key)
+        if code is None and key not in _SECONDS:
+            _SECONDS[key] = 0.0
+            content = recall(key)
+            code = None if content is None else Code(*content)
+        return None if code is None else self._loaded(key, code, kind)
+
+    def _built(self, key: str, kind: Kind) -> Function | None:
+        if _SECONDS[key] < BUILD_SECONDS or find_compiler() is None:
+            return None
+        programs = kind.programs()
+        code = self._code(programs, kind)
+        function = self._loaded(key, code, kind)
+        if function is None:
+            _SECONDS[key] = -float("inf")
+        else:
+            remember(key, [*code])
+        return function
+
+    def _code(self, programs: dict[str, Program], kind: Kind) -> Code:
+        constants = [program.constants for program in programs.values()]
+        every = torch.cat([x.evaluate() for x in constants])
+        numbers = LiveNumbers([*programs.values()], every[None])
+        text = kind.text(programs, numbers)
+        assert self._watch is not None
+        addresses = {_identity(x): k for k, x in enumerate(self._watch.tensors)}
+        leaves = [
+            [addresses.get(_identity(x), x.detach().clone()) for x in item.leaves]
+            for item in constants
+        ]
+        return Code(
+            text,
+            [item.packed() for item in constants],
+            leaves,
+            torch.tensor(numbers.index, dtype=torch.int64),
+            torch.tensor([*numbers.fixed], dtype=torch.int64),
+            torch.tensor([*numbers.fixed.values()], dtype=torch.float64),
+        )
+
+    def _loaded(self, key: str, code: Code, kind: Kind) -> Function | None:
+        """Return the function of code with the present numbers, if it agrees with Python."""
+        assert self._watch is not None
+        values = code.values(self._watch.tensors)
+        if values is None:
+            return None
+        function = kind.loaded(load_code(code.text, kind.flags), values)
+        if not kind.agrees(function):
+            return None
+        if len(_CODES) >= _MOST:
+            _CODES.pop(next(iter(_CODES)))
+        _CODES[key] = code
+        return function
+
+
+_CODES: dict[str, Code] = {}
+"""Code of this process by the digest of a kind of model."""
+_SECONDS: defaultdict[str, float] = defaultdict(float)
+"""Processor time of Python by the digest of a kind of model; -inf where C is not possible."""
+
+
+def _identity(value: Tensor) -> tuple[Any, ...]:
+    return value.data_ptr(), value.shape, value.stride(), value.dtype
+
+
+def agree(results: Tensor, expected: Tensor) -> bool:
+    """Return true if results ``(K, ...)`` are the expected ones up to rounding.
+
+    Differences are relative to the norm of a row, or to the RMS of all norms if this is larger.
+    Where an expected row is not finite, the result must not be finite.
+    """
+    rows, truth = results.flatten(1), expected.flatten(1)
+    finite = truth.isfinite().all(-1)
+    norms = torch.linalg.vector_norm(truth, dim=-1)
+    typical = norms[finite].square().mean().sqrt() if finite.any() else norms.new_zeros(())
+    error = torch.linalg.vector_norm(rows - truth, dim=-1)
+    close = error <= _TOLERANCE * torch.maximum(norms, typical) + 1e-12
+    return bool(torch.where(finite, close, ~rows.isfinite().all(-1)).all())
+
+
+def spread_around(rows: Tensor) -> Tensor:
+    """Return :data:`STATES` rows: a half of the given ones ``(K, n)``, and a half beside them."""
+    picked = rows[torch.linspace(0, len(rows) - 1, STATES // 2).round().long()]
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(2, *picked.shape, generator=generator, dtype=rows.dtype)
+    spread = rows.std(0) if len(rows) > 1 else torch.zeros_like(rows[0])
+    beside = picked * (1 + 0.3 * noise[0]) + (spread + 0.3) * noise[1]
+    return torch.cat([picked, beside])
+
+
+class _Rows(Kind):
+    """A function of the rows of tensors, which computes them independently."""
+
+    flags = QUICK
+
+    def __init__(self, name: str, function: Callable[[Tensor], Tensor], rows: Tensor):
+        self.name, self._function, self._rows = name, function, rows.reshape(-1, rows.shape[-1])
+
+    def programs(self) -> dict[str, Program]:
+        return {"row": trace(self._function, {"x": self._rows[0]}, ["y"])}
+
+    def text(self, programs: dict[str, Program], numbers: LiveNumbers) -> str:
+        program = programs["row"]
+        n, m = program.inputs["x"].numel(), program.outputs["y"].numel()
+        lines = c_function(program, numbers).lines
+        return _ROWS.format(
+            prelude=PRELUDE,
+            definitions="\n".join(numbers.definitions()),
+            lines="\n".join(lines),
+            n=n,
+            m=m,
+        )
+
+    def loaded(self, library: ctypes.CDLL, values: Tensor) -> Function:
+        function, n, m = self._function, self._rows.shape[-1], library.outputs()
+        pointer = ctypes.c_void_p
+        library.rows.argtypes = [pointer, ctypes.c_long, pointer, pointer]
+
+        def call(rows: Tensor) -> Tensor:
+            if rows.shape[-1] != n or rows.dtype != torch.float64 or not rows.is_cpu:
+                return function(rows)  # which refuses wrong shapes
+            rows = rows.contiguous()
+            result = rows.new_empty(*rows.shape[:-1], m)
+            library.rows(values.data_ptr(), rows.numel() // n, rows.data_ptr(), result.data_ptr())
+            return result
+
+        return call
+
+    def agrees(self, function: Function) -> bool:
+        rows = spread_around(self._rows[self._rows.isfinite().all(-1)])
+        return agree(function(rows), self._function(rows))
+
+
+_ROWS = """\
+#define lanes(x) (x)
+typedef double real;
+{prelude}
+#define VALUES values
+{definitions}
+static void row(const double *values, const real *restrict x, real *restrict y)
+{{
+{lines}
+}}
+int outputs(void) {{ return {m}; }}
+void rows(const double *values, long count, const real *x, real *y)
+{{ for (; count > 0; count--, x += {n}, y += {m}) row(values, x, y); }}
+"""

@@ -1,0 +1,102 @@
+"""Constants of C code that are arguments, so that models of one structure share the code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.exports.c_code import ConstantArrays
+from pinn_dyn.exports.program import Program
+
+
+class LiveNumbers(ConstantArrays):
+    """Arrays whose numbers the code reads from its argument ``values``.
+
+    The code contains those numbers of a model that are 0, 1 or -1, which often follow from its
+    structure. It is that of other models only if they have the same numbers there.
+
+    Args:
+        programs: the programs of the code.
+        numbers: all constants of the programs one after the other, of K models, ``(K, n)``.
+
+    Attributes:
+        index: positions of the numbers that ``values`` holds in turn.
+        fixed: number that the code contains, by its position.
+        read: expression of the array of numbers.
+        address: expression of its start for trajectory b, with a field for its length.
+    """
+
+    arguments = ("values",)
+    read, address = "values", "values"
+
+    def __init__(self, programs: Sequence[Program], numbers: Tensor):
+        super().__init__("double")
+        self._numbers = numbers
+        self._starts: dict[int, int] = {}
+        self._places: dict[bytes, int] = {}
+        self.index: list[int] = []
+        self.fixed: dict[int, float] = {}
+        start = 0
+        for values in (x for program in programs for x in program.stored()):
+            self._starts[values.untyped_storage().data_ptr()] = start
+            start += values.numel()
+
+    def name(self, values: Tensor) -> str:
+        if not values.dtype.is_floating_point:
+            self._fix(values)
+            return super().name(values)
+        return f"(VALUES + {self._place(self._positions(values))})"
+
+    def elements(self, values: Tensor) -> list[float | str]:
+        if not values.dtype.is_floating_point:
+            self._fix(values)
+            return super().elements(values)
+        positions = self._positions(values)
+        place = self._place(positions)
+        numbers: list[float | str] = []
+        for k, position in enumerate(positions.tolist()):
+            number = self._fixed(position)
+            numbers.append(f"VALUES[{place + k}]" if number is None else number)
+        return numbers
+
+    def common(self, values: Tensor) -> float | None:
+        if not values.dtype.is_floating_point:
+            self._fix(values)
+            return super().common(values)
+        positions = self._positions(values).tolist()
+        numbers = {self._fixed(position) for position in positions}
+        return numbers.pop() if len(numbers) == 1 else None
+
+    def spread(self, text: str) -> str:
+        return f"lanes({text})"
+
+    def _positions(self, values: Tensor) -> Tensor:
+        """Return the positions of the numbers of a stored constant, or of a view of it."""
+        storage = values.untyped_storage()
+        places = torch.arange(storage.nbytes() // values.element_size())
+        view = places.as_strided(values.shape, values.stride(), values.storage_offset())
+        return view.flatten() + self._starts[storage.data_ptr()]
+
+    def _place(self, positions: Tensor) -> int:
+        key = positions.numpy().tobytes()
+        if key not in self._places:
+            self._places[key] = len(self.index)
+            self.index += positions.tolist()
+        return self._places[key]
+
+    def _fix(self, values: Tensor) -> None:
+        """Let the code contain indices or truth values, which the operations may have made."""
+        if values.untyped_storage().data_ptr() in self._starts:
+            positions = self._positions(values).tolist()
+            self.fixed.update(zip(positions, values.flatten().double().tolist(), strict=True))
+
+    def _fixed(self, position: int) -> float | None:
+        """Return the number at a position if it is 0, 1 or -1 in all models."""
+        column = self._numbers[:, position]
+        number = float(column[0])
+        if abs(number) not in (0.0, 1.0) or not bool((column == number).all()):
+            return None
+        self.fixed[position] = number
+        return number

@@ -1,0 +1,223 @@
+"""Numbers and attributes that functions of a model read, and whether they have changed."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import sys
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from operator import is_, itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+_LIBRARIES = sys.stdlib_module_names | {"pinn_dyn", "torch", "numpy", "scipy", "builtins"}
+"""Packages whose functions and classes stay as they are."""
+_PLAIN = (type(None), bool, int, float, complex, str, bytes)
+_MODULE = frozenset(vars(nn.Module())) - {"_parameters", "_buffers", "_modules"}
+_MEMBERS = {
+    property: ("fget",),
+    functools.cached_property: ("func",),
+    partial: ("func", "args", "keywords"),
+}
+_CLASS = {"__dict__", "__weakref__", "__doc__", "__module__", "_abc_impl", "__annotations__"}
+
+
+class Watch:
+    """All that functions of some objects read, found by following attributes and code.
+
+    It follows attributes, containers and submodules, and of classes and functions of the user also
+    their code, default values, closures and global names. Classes of libraries stay as they are.
+
+    Args:
+        roots: models, other objects, classes or functions.
+
+    Attributes:
+        tensors: the tensors, in the order in which they were found.
+    """
+
+    def __init__(self, *roots: Any):
+        self.tensors: list[Tensor] = []
+        self._arrays: list[tuple[Tensor | None, int, np.ndarray, bytes]] = []
+        self._parts: list[tuple[Any, int, Callable[[Any], Iterable[Any]], list[Any]]] = []
+        self._words: list[Any] = []
+        self._seen: dict[int, tuple[int, Any]] = {}
+        for root in roots:
+            self._visit(root)
+        self._seen.clear()
+
+    def changed(self) -> bool:
+        """Return true if a number, an attribute or a function is not that of the start."""
+        try:
+            for container, size, read, before in self._parts:
+                if len(container) != size or not all(map(is_, read(container), before)):
+                    return True
+        except KeyError:  # of an attribute that is gone
+            return True
+        for tensor, address, view, content in self._arrays:
+            if tensor is not None and tensor.data_ptr() != address:
+                return True
+            if view.tobytes() != content:
+                return True
+        return False
+
+    def digest(self) -> str:
+        """Return the SHA-256 of all but the numbers in tensors.
+
+        The zeros and ones of a tensor belong to the digest, since code may do without them.
+        """
+        return hashlib.sha256(repr([_package(), *self._words]).encode()).hexdigest()
+
+    def _visit(self, value: Any) -> None:
+        """Follow a value, and describe it."""
+        if isinstance(value, _PLAIN):
+            self._words.append(value)
+        elif id(value) in self._seen:
+            self._words.append(f"see {self._seen[id(value)][0]}")
+        else:
+            self._seen[id(value)] = len(self._seen), value  # an address names a living object
+            self._follow(value)
+
+    def _follow(self, value: Any) -> None:
+        if isinstance(value, Tensor):
+            self._tensor(value)
+        elif isinstance(value, np.ndarray):
+            self._words.append((value.dtype.str, value.shape, value.tobytes()))
+            self._arrays.append((None, 0, value, value.tobytes()))
+        elif isinstance(value, Mapping):
+            self._part(value, value.keys())
+            for key, item in value.items():
+                self._words.append(str(key))
+                self._visit(item)
+        elif isinstance(value, (list, tuple, set, frozenset)):
+            if not isinstance(value, (tuple, frozenset)):
+                self._parts.append((value, len(value), iter, [*value]))
+            for item in sorted(value, key=str) if isinstance(value, (set, frozenset)) else value:
+                self._visit(item)
+        elif isinstance(value, (staticmethod, classmethod, types.MethodType)):
+            self._visit(getattr(value, "__self__", None))
+            self._visit(value.__func__)
+        elif isinstance(value, types.FunctionType):
+            self._function(value)
+        elif isinstance(value, type):
+            self._class(value)
+        elif getattr(value, "is_unwatched", False):
+            return
+        elif not isinstance(value, (types.ModuleType, types.BuiltinFunctionType)):
+            self._object(value)
+        else:
+            self._words.append(value.__name__)
+
+    def _part(self, mapping: Mapping[str, Any], keys: Iterable[str]) -> None:
+        """Watch the number of items of a mapping, and which objects the values of keys are."""
+        names = [*keys]
+        single = len(names) == 1
+        read = itemgetter(*names, *names[:single]) if names else lambda _: ()
+        self._parts.append((mapping, len(mapping), read, [*read(mapping)]))
+
+    def _tensor(self, value: Tensor) -> None:
+        self.tensors.append(value)
+        self._words.append((str(value.dtype), tuple(value.shape), value.stride()))
+        if not value.is_cpu:
+            return
+        view = value.detach().numpy()
+        self._arrays.append((value, value.data_ptr(), view, view.tobytes()))
+        if view.dtype.kind == "f":
+            self._words += [np.packbits(view == number).tobytes() for number in (0, 1, -1)]
+        else:
+            self._words.append(view.tobytes())
+
+    def _object(self, value: Any) -> None:
+        self._words.append(type(value).__qualname__)
+        self._visit(type(value))
+        skipped = _MODULE if isinstance(value, nn.Module) else frozenset()
+        attributes = getattr(value, "__dict__", {})
+        names = [name for name in attributes if name not in skipped]
+        self._part(attributes, names)
+        items = {name: attributes[name] for name in names}
+        slots = [x for kind in type(value).__mro__ for x in getattr(kind, "__slots__", ())]
+        for name in [*slots, *_MEMBERS.get(type(value), ())]:
+            items[name] = getattr(value, name, None)
+        for name, item in items.items():
+            self._words.append(name)
+            self._visit(item)
+
+    def _class(self, kind: type) -> None:
+        self._words.append(f"{kind.__module__}.{kind.__qualname__}")
+        for base in kind.__mro__:
+            if base.__module__.partition(".")[0] in _LIBRARIES:
+                continue
+            members = {x: y for x, y in vars(base).items() if x not in _CLASS}
+            self._part(vars(base), members)
+            for name, member in members.items():
+                self._words.append(name)
+                self._visit(member)
+
+    def _function(self, function: types.FunctionType) -> None:
+        self._words.append(function.__qualname__)
+        if function.__module__ is None or function.__module__.partition(".")[0] in _LIBRARIES:
+            if function.__closure__ is None:
+                return
+        else:
+            self._words.append(_instructions(function.__code__))
+            self._names(function)
+        self._visit(function.__defaults__)
+        self._visit(function.__kwdefaults__)
+        for cell in function.__closure__ or ():
+            self._parts.append(([cell], 1, lambda cells: map(_content, cells), [_content(cell)]))
+            self._visit(_content(cell))
+
+    def _names(self, function: types.FunctionType) -> None:
+        """Follow the global names that a function of the user reads, also in modules."""
+        names = {*_names_in(function.__code__)}
+        spaces = [function.__globals__]
+        for space in spaces:  # grows meanwhile
+            known = sorted(names & space.keys())
+            self._parts.append(
+                (known, len(known), partial(_looked_up, space), [space[x] for x in known])
+            )
+            for name in known:
+                item = space[name]
+                if not isinstance(item, types.ModuleType):
+                    self._words.append(name)
+                    self._visit(item)
+                elif item.__name__.partition(".")[0] not in _LIBRARIES:
+                    spaces += [vars(item)] * all(x is not vars(item) for x in spaces)
+
+
+def _looked_up(space: Mapping[str, Any], names: Sequence[str]) -> list[Any]:
+    return [space.get(name) for name in names]
+
+
+def _content(cell: types.CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # not assigned yet
+        return None
+
+
+def _inner(code: types.CodeType) -> list[types.CodeType]:
+    return [x for x in code.co_consts if isinstance(x, types.CodeType)]
+
+
+def _instructions(code: types.CodeType) -> Any:
+    """Return what a function does, without its comments and the names of files and lines."""
+    numbers = [x for x in code.co_consts if not isinstance(x, types.CodeType)]
+    return code.co_code, code.co_names, repr(numbers), [*map(_instructions, _inner(code))]
+
+
+def _names_in(code: types.CodeType) -> list[str]:
+    return [*code.co_names, *(name for x in _inner(code) for name in _names_in(x))]
+
+
+@functools.cache
+def _package() -> str:
+    """Return a digest of the sizes and times of the files of this package, and of PyTorch."""
+    files = sorted(Path(__file__).parents[1].rglob("*.py"))
+    states = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    return hashlib.sha256(repr([torch.__version__, *states]).encode()).hexdigest()
