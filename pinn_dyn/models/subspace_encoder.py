@@ -204,8 +204,8 @@ class EncodedPredictor(Predictor):
         mean, std = self.mean[: 2 * size], self.std[: 2 * size]
         offset = (start.unsqueeze(-2) - mean) / std - y[..., :1, :]
         steps = torch.arange(len(t), device=t.device)[:, None]
-        kept = (self._shares * torch.sigmoid(self.fade) ** steps.unsqueeze(-1)).sum(-1)
-        moved = y - y[..., :1, :] + offset * (kept - 1)
+        lost = self._shares * (1 - torch.sigmoid(self.fade) ** steps.unsqueeze(-1))
+        moved = y - y[..., :1, :] - offset * lost.sum(-1)
         return std * moved + (steps > 0) * (start - measured).unsqueeze(-2)
 
 
