@@ -23,7 +23,6 @@ _SLOWEST, _FASTEST = 0.4, 1.2  # initial eigenfrequencies, rad in a step
 _DAMPING = 0.5  # initial damping ratio
 _SPREAD = 0.3  # initial entries of the factors of K and D, times the root of n
 _COUPLING = 0.1  # initial entries of W, times the root of n
-_CHANGE = 5.0  # weight of the change of u over a step, which is a fraction of the spread of u
 _NEWTON_STEPS, _HALVINGS = 100, 8
 
 
@@ -210,7 +209,7 @@ class CoupledOscillators(EncodedPredictor):
     def step_force(self, ends: Tensor) -> Tensor:
         """Return f of the normalized inputs at the ends of a step, ``(*batch, 2M)``."""
         start, end = ends.chunk(2, dim=-1)
-        return self.force(torch.cat([(start + end) / 2, _CHANGE * (end - start)], dim=-1))
+        return self.force(torch.cat([(start + end) / 2, end - start], dim=-1))
 
     def latent_force(self, u: Tensor) -> Tensor:
         """Return f(u, 0), ``(*batch, n)``, at a constant u ``(*batch, M)``."""
