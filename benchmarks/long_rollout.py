@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.evaluation.prediction import model_for_rollouts
-from pinn_dyn.exports import c_loop
+from pinn_dyn.exports import compiled
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, double_copy
 from pinn_dyn.models import (
     CoulombFriction,
@@ -77,6 +77,12 @@ def timed(work: Callable[[], Tensor]) -> tuple[float, Tensor]:
     return clock() - start, result
 
 
+def forget() -> None:
+    """Forget all code, as the next process has none."""
+    compiled._CODES.clear()
+    compiled._SECONDS.clear()
+
+
 def measure(model: ContinuousPredictor, trajectories: int, steps: int, timed_steps: int) -> dict:
     """Return steps per second of both loops, and the processor time to build the loop.
 
@@ -95,8 +101,8 @@ def measure(model: ContinuousPredictor, trajectories: int, steps: int, timed_ste
 
     fast = model_for_rollouts(model)
     build, _ = timed(lambda: roll_out(fast, timed_steps))
-    c_loop._LOOPS.clear()  # as in the next process
-    c_loop._WITHOUT.clear()
+    forget()
+    fast = model_for_rollouts(model)
     cached, _ = timed(lambda: roll_out(fast, timed_steps))
     seconds, states = timed(lambda: roll_out(fast, steps))
     short, _ = timed(lambda: [roll_out(fast, min(steps, SHORT)) for _ in range(CALLS)][-1])
@@ -147,7 +153,7 @@ def main() -> None:
     arguments = parser.parse_args()
     locked = FINGERS if arguments.locked is None and arguments.urdf == PANDA else arguments.locked
     torch.set_num_threads(1)
-    c_loop.STEPS = 1
+    compiled.BUILD_SECONDS = 0.0
     chain = RigidChain(arguments.urdf, locked_joints=locked or [])
     cases = [(1, 600, 20)] if arguments.quick else [(1, 50_000, 200), (1000, 100, 5)]
     about = {"robot": Path(arguments.urdf).stem, "joints": chain.num_coordinates}
@@ -156,8 +162,7 @@ def main() -> None:
         os.environ["PINN_DYN_CACHE"] = folder
         for name, model in models_of(chain).items():
             for trajectories, steps, timed_steps in cases:
-                c_loop._LOOPS.clear()
-                c_loop._WITHOUT.clear()
+                forget()
                 row = {**about, "model": name, "trajectories": trajectories, "steps": steps}
                 rows.append({**row, **measure(model, trajectories, steps, timed_steps)})
                 print(rows[-1], flush=True)

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from pinn_dyn.envs import ModelPlant, RobotEnv, RobotVectorEnv
 from pinn_dyn.evaluation.prediction import model_for_rollouts
-from pinn_dyn.exports import c_loop
+from pinn_dyn.exports import compiled
 from pinn_dyn.exports.exported import write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Signal, Trajectory, double_copy
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="smoke run: few steps, no file")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    c_loop.STEPS = 1
+    compiled.BUILD_SECONDS = 0.0
     steps, rounds = (5, 1) if arguments.quick else (STEPS, arguments.rounds)
     chain = RigidChain(PANDA, locked_joints=FINGERS)
     model = double_copy(models_of(chain)["known"])

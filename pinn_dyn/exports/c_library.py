@@ -6,7 +6,9 @@ import ctypes
 import hashlib
 import logging
 import os
+import shutil
 import subprocess
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -27,6 +29,8 @@ QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
 The code has 0.7 to 0.8 of its speed (benchmarks/long_rollout.py)."""
 
 _MOST_PROGRAMS = 100  # in the cache folder
+_UNFINISHED = "unfinished-"  # start of the names of folders of running compilations
+_LONGEST = 3600.0  # time of a compilation, s
 
 
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
@@ -48,7 +52,9 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     for library in _unchanged(digest, "so"):
         return ctypes.CDLL(str(library))
     is_cache = _is_safe(folder) and os.access(folder, os.W_OK)
-    with TemporaryDirectory(dir=folder if is_cache else None) as name:
+    if is_cache:
+        _remove_unfinished(folder)
+    with TemporaryDirectory(dir=folder if is_cache else None, prefix=_UNFINISHED) as name:
         source = Path(name) / "code.c"
         source.write_text(code)
         compiled = compile_c(compiler, flags, source)
@@ -59,12 +65,20 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     return loaded
 
 
+def _remove_unfinished(folder: Path) -> None:
+    """Delete what killed processes have left of compilations."""
+    for path in folder.glob(f"{_UNFINISHED}*"):
+        with suppress(OSError):
+            if time.time() - path.stat().st_mtime > _LONGEST:
+                shutil.rmtree(path)
+
+
 def remember(key: str, content: Any) -> None:
     """Keep tensors and plain values in the cache folder, for :func:`recall` in later processes."""
     folder = _folder()
     if not _is_safe(folder):
         return
-    with suppress(OSError), TemporaryDirectory(dir=folder) as name:
+    with suppress(OSError), TemporaryDirectory(dir=folder, prefix=_UNFINISHED) as name:
         path = Path(name) / "code.pt"
         torch.save(content, path)
         path.chmod(0o600)
@@ -78,8 +92,9 @@ def remember(key: str, content: Any) -> None:
 def recall(key: str) -> Any:
     """Return what :func:`remember` has kept, or None."""
     for path in _unchanged(key, "pt"):
-        os.utime(path)  # the oldest files are deleted
-        return torch.load(path, weights_only=True)
+        with suppress(Exception):  # of another version of PyTorch
+            os.utime(path)  # the oldest files are deleted
+            return torch.load(path, weights_only=True)
     return None
 
 

@@ -168,6 +168,16 @@ def test_a_second_load_reads_the_cache(cache, splits, monkeypatch):
     assert torch.equal(again.test[0].v, splits.test[0].v)
 
 
+def test_a_recording_of_another_simulator_is_made_again(tmp_path, monkeypatch, caplog):
+    pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
+    before = build(tmp_path, duration=0.05).load().train[0].q
+    kind = type(build(tmp_path).system)
+    step = kind.step
+    monkeypatch.setattr(kind, "step", lambda self, force, h: step(self, 0.9 * force, h))
+    assert not torch.equal(build(tmp_path, duration=0.05).load().train[0].q, before)
+    assert "made again" in caplog.text
+
+
 def test_what_changes_the_motion_changes_the_key(source, cache):
     changes = [
         {"seed": 1},

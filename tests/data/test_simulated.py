@@ -15,7 +15,7 @@ from pinn_dyn.data.cache import cache_key
 from pinn_dyn.mechanics import RK4, Signal
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.systems import SoftArm
-from pinn_dyn.testing import damped_oscillators
+from pinn_dyn.testing import LinearSystem, damped_oscillators
 
 SINE = dict(offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.1], frequency=[1.0, 4.0])
 STEPS = dict(offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.1], hold=[0.06, 0.1])
@@ -294,3 +294,65 @@ def test_constants_in_tensors_are_part_of_the_entry(tmp_path):
 
     assert describe(1.0) == describe(1.0)
     assert describe(1.0) != describe(2.0)
+
+
+GRAVITY = 1.0
+
+
+class Ball(LinearSystem):
+    """A system that reads an attribute of its class, a global number and another function."""
+
+    gravity = 1.0
+
+    def _potential_force(self, q):
+        return super()._potential_force(q) + self.gravity * GRAVITY * self.law(q)
+
+    @staticmethod
+    def law(q):
+        return torch.sin(q)
+
+
+class Scaled(MultiSine):
+    """An excitation with a number that is no setting."""
+
+    factor = 1.0
+
+    def draw(self, count, duration, rng):
+        signal = super().draw(count, duration, rng)
+        return lambda times: self.factor * signal(times)
+
+
+PRESENT = {
+    "global": lambda patch: patch.setitem(Ball._potential_force.__globals__, "GRAVITY", 2.0),
+    "class": lambda patch: patch.setattr(Ball, "gravity", 2.0),
+    "function": lambda patch: patch.setattr(Ball, "law", staticmethod(torch.cos)),
+    "excitation": lambda patch: patch.setattr(Scaled, "factor", 2.0),
+    "nothing": lambda patch: patch.setattr(Ball, "__doc__", "A ball."),
+}
+
+
+@pytest.mark.parametrize("change", PRESENT)
+def test_a_recording_of_other_code_is_made_again_with_a_message(
+    tmp_path, monkeypatch, caplog, change
+):
+    def load(folder):
+        return make_source(
+            folder,
+            system=Ball([[1.0]], [[4.0]], [[0.1]], [[1.0]]).double().requires_grad_(False),
+            excitation=Scaled([0.0], [1.0], frequency=[1.0, 4.0]),
+            initial_states=InitialStates([-1.0], [1.0], [0.1]),
+            labels=["q"],
+            input_labels=["u"],
+            configurations={},
+        ).load()
+
+    before = load(tmp_path).train[0].q
+    PRESENT[change](monkeypatch)
+    found, expected = load(tmp_path).train[0].q, load(tmp_path / "other").train[0].q
+    assert torch.equal(found, expected)
+    is_same = change == "nothing"
+    assert torch.equal(found, before) == is_same
+    assert ("made again" in caplog.text) == (not is_same)
+    caplog.clear()
+    load(tmp_path)
+    assert "made again" not in caplog.text
