@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -47,6 +47,18 @@ def _slopes(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """Return dy/dx ``(*batch, n, m)`` of y = f(x) ``(*batch, n)``, row by row."""
     rows = torch.func.vmap(torch.func.jacrev(function))(x.reshape(-1, x.shape[-1]))
     return rows.reshape(*x.shape[:-1], *rows.shape[1:])
+
+
+def _refuse_force_without_changes(
+    force: LinearAndMLP, state: dict[str, Tensor], prefix: str, *_: Any
+) -> None:
+    """Refuse the weights of a force of u alone, which earlier versions had."""
+    weight = state.get(f"{prefix}first.weight")
+    if weight is not None and weight.shape != force.first.weight.shape:
+        raise ValueError(
+            "the force of these oscillators is of an earlier form, without the change of the "
+            "inputs over a step: train the model again"
+        )
 
 
 class MeasuredCoordinates(nn.Module):
@@ -134,7 +146,7 @@ class CoupledOscillators(EncodedPredictor):
         hidden, activation: widths and activation of the hidden layers of encoder and output.
         force_hidden: widths of the hidden layers of f.
         output: network of (z, z'), or the first coordinates of z.
-        initial_velocity: see :class:`EncodedPredictor`.
+        fade, initial_velocity: see :class:`EncodedPredictor`. fade has no effect on coordinates.
 
     Raises:
         ValueError: if ``output="coordinates"`` leaves no hidden coordinate.
@@ -149,11 +161,12 @@ class CoupledOscillators(EncodedPredictor):
         activation: Activation = "tanh",
         force_hidden: Sequence[PositiveInt] = (64,),
         output: Literal["network", "coordinates"] = "network",
+        fade: Annotated[float, Field(gt=0, lt=1)] | None = None,
         initial_velocity: InitialVelocityHead | None = None,
     ):
         self._force_hidden = force_hidden
         sizes = 2 * oscillators, hidden, activation
-        super().__init__(statistics, history, *sizes, initial_velocity)
+        super().__init__(statistics, history, *sizes, fade, initial_velocity)
         if output == "coordinates":
             self._measure_coordinates(hidden, activation)
 
@@ -173,6 +186,7 @@ class CoupledOscillators(EncodedPredictor):
         frequency = torch.linspace(math.log(_SLOWEST), math.log(_FASTEST), n)
         mixed = _SPREAD * torch.randn(2, n, n) / n**0.5
         self.force = LinearAndMLP(2 * inputs, n, self._force_hidden, activation)
+        self.force.register_load_state_dict_pre_hook(_refuse_force_without_changes)
         self.stiffness = nn.Parameter(torch.diag(frequency) + mixed[0].tril(-1))
         damping = (frequency + math.log(2 * _DAMPING)) / 2
         self.damping = nn.Parameter(torch.diag(damping) + mixed[1].tril(-1))

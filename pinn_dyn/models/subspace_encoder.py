@@ -54,10 +54,11 @@ class LinearAndMLP(nn.Module):
         return y + h
 
 
-def _refuse_earlier_form(model: nn.Module, state: dict[str, Tensor], *_: Any) -> None:
-    """Refuse weights of a model whose offset has one time constant."""
-    if "share" not in state:
-        raise ValueError("these are weights of an earlier form of the model: train it again")
+def _add_shares(model: nn.Module, state: dict[str, Tensor], *_: Any) -> None:
+    """Complete the weights of a model whose offset has one time constant."""
+    if "share" not in state and "fade" in state:
+        state["fade"] = state["fade"].unsqueeze(-1).repeat(1, _TIMES)
+        state["share"] = torch.zeros_like(state["fade"])
 
 
 class EncodedPredictor(Predictor):
@@ -87,6 +88,7 @@ class EncodedPredictor(Predictor):
             Pieces of a log keep 2 s.
         latent: size of z.
         hidden, activation: widths and activation of the hidden layers of all networks.
+        fade: initial exp(-h / tau_j) of all j; None takes tau_j from a step to the windows.
         initial_velocity: builder of the head for v_0.
     """
 
@@ -101,6 +103,7 @@ class EncodedPredictor(Predictor):
         latent: int,
         hidden: Sequence[PositiveInt],
         activation: Activation,
+        fade: float | None = None,
         initial_velocity: InitialVelocityHead | None = None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
@@ -115,13 +118,15 @@ class EncodedPredictor(Predictor):
         self._add_transition(inputs, latent, hidden, activation)
         self.output: nn.Module = LinearAndMLP(latent, 2 * size, hidden, activation)
         longest = len(statistics.qv_increment_std)  # steps of a window
-        fade = (-1 / torch.logspace(0, math.log10(longest), _TIMES)).exp()
-        self.fade = nn.Parameter(torch.logit(fade).repeat(2 * size, 1))
+        start = (-1 / torch.logspace(0, math.log10(longest), _TIMES)).exp()
+        if fade is not None:
+            start = torch.full_like(start, fade)
+        self.fade = nn.Parameter(torch.logit(start).repeat(2 * size, 1))
         self.share = nn.Parameter(torch.zeros(2 * size, _TIMES))
         scales = Scales(statistics, statistics.v_std)
         self.initial_velocity = initial_velocity and initial_velocity(scales)
         self.memory_size = latent + self.fade.numel()
-        self.register_load_state_dict_pre_hook(_refuse_earlier_form)
+        self.register_load_state_dict_pre_hook(_add_shares)
 
     @abc.abstractmethod
     def _add_transition(
@@ -226,8 +231,9 @@ class SubspaceEncoder(EncodedPredictor):
         latent: PositiveInt = 12,
         hidden: Sequence[PositiveInt] = (64,),
         activation: Activation = "tanh",
+        fade: Annotated[float, Field(gt=0, lt=1)] | None = None,
     ):
-        super().__init__(statistics, history, latent, hidden, activation)
+        super().__init__(statistics, history, latent, hidden, activation, fade)
 
     def _add_transition(
         self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation
