@@ -160,7 +160,7 @@ def test_limits_may_be_arrays_and_tensors(tmp_path, kind):
     limits = {"low": [-1.0, -2.0], "high": [6.5, 2.5], "rate": 700.0}
     given = {name: kind(value) for name, value in limits.items()}
     inputs = [
-        list(called(Pipeline(Counting(), PERIOD, actuator=Actuator(**x)), 4))[0]
+        next(iter(called(Pipeline(Counting(), PERIOD, actuator=Actuator(**x)), 4)))
         for x in (limits, given)
     ]
     assert inputs[0] == inputs[1]
