@@ -58,6 +58,7 @@ class DelayCurve:
         spread: standard deviation of the estimate by the jackknife and over kernels, s.
         friction: dry friction over the spread of the input; NaN if it is not determined.
         friction_spread: standard deviation of ``friction`` by the jackknife.
+        other: curve of the other equation of motion, if its smallest residual is elsewhere.
         form: equation of motion.
         reason: reason why there is no delay, "" otherwise.
     """
@@ -70,6 +71,7 @@ class DelayCurve:
     reason: str = ""
     friction: float = np.nan
     friction_spread: float = np.nan
+    other: DelayCurve | None = None
 
     @property
     def of_bodies(self) -> bool:
@@ -131,10 +133,8 @@ def input_delays(
     of_bodies = best.pop(_RIGID, None)
     curves = _agreed(list(best.values()), step)
     if of_bodies is not None:
-        curves = [
-            rigid_curve if not rigid_curve.reason else curve
-            for curve, rigid_curve in zip(curves, of_bodies, strict=True)
-        ]
+        pairs = zip(curves, of_bodies, strict=True)
+        curves = [_better(generic, rigid_curve, step) for generic, rigid_curve in pairs]
     for i in range(inputs):
         signals = [item.u[:, i] for item in recordings]
         if not any(np.ptp(x) for x in signals):
@@ -164,6 +164,14 @@ def clear_delays(curves: Sequence[DelayCurve], step: float) -> list[float]:
         widths = np.full(len(curves), widths[usable].min())
     clear = (values >= step) & (values - widths > step / 2)
     return np.where(clear, values, 0.0).tolist()
+
+
+def _better(generic: DelayCurve, rigid: DelayCurve, step: float) -> DelayCurve:
+    """Return the curve of rigid bodies if it has a delay, with the generic one if they differ."""
+    best, other = (rigid, generic) if not rigid.reason else (generic, rigid)
+    places = [minimum(x.candidates, x.residual) for x in (best, other)]
+    differ = other.form != best.form and abs(places[0] - places[1]) > step
+    return replace(best, other=other if differ else None)
 
 
 def _agreed(forms: Sequence[list[DelayCurve]], step: float) -> list[DelayCurve]:

@@ -105,6 +105,11 @@ class Equation:
         squares = [np.bincount(self.window, column) for column in (self.row_weights * x**2).T]
         return np.sqrt(np.transpose(squares) / np.bincount(self.window)[:, None])
 
+    def dry_friction(self) -> np.ndarray:
+        """Return the part of X theta that is dry friction of the own joint, ``(R,)``."""
+        rows = list(self.friction)
+        return np.asarray(self._terms()[:, rows] @ self.theta[rows, 0])
+
     def _fitted(self, weights: np.ndarray) -> np.ndarray:
         """Return coefficients for other weights of the windows, ``(1, B)``."""
         rows = self.row_weights * np.sqrt(weights[0][self.window])[:, None]
@@ -128,11 +133,13 @@ class Motion:
         data: averages.
         window: number of the window of each row, ``(R,)``.
         equations: an equation of each input, or of v or a.
+        drawn: the equations of rigid bodies, if there is a robot, else the same.
     """
 
     data: Averages
     window: np.ndarray
     equations: Sequence[Equation]
+    drawn: Sequence[Equation]
 
     def residual(self, weights: Sequence[np.ndarray] | None = None) -> np.ndarray:
         """Return the residual of each window of all equations, ``(B, K)``."""
@@ -167,6 +174,8 @@ def equations_of_motion(
     size = len(u.columns)
     if not len(data):
         return None
+    equations: list[Equation] = []
+    drawn: list[Equation] = []
     if size > len(q.columns):
         inputs = data.u[:, :size]
         inputs = (inputs - inputs.mean(axis=0)) / inputs.std(axis=0).clip(min=1e-300)
@@ -177,7 +186,6 @@ def equations_of_motion(
         equations = [min(forms, key=lambda x: np.median(x.of_windows()))]
     elif size:
         regressor = bodies(data, rigid)
-        equations = []
         for i in range(size):
             forms = [
                 _equation(
@@ -192,13 +200,16 @@ def equations_of_motion(
             ]
             least = [float(np.median(x.of_windows())) for x in forms]
             # Rigid bodies judge motions well that no other run has, unless a force is missing.
+            drawn.append(forms[-1])
             best = -1 if least[-1] < _WORSE * least[0] else 0
             equations.append(replace(forms[best], of_bodies=best == -1 and len(forms) > 1))
     else:
         columns = {"terms": terms(data, "acceleration")}
         equations = [_equation(columns, data.a, data, window, q.columns)]
     count = max(sum(x.columns[k].shape[1] for k in x.x) for x in equations)
-    return Motion(data, window, equations) if len(data) >= _PER_TERM * count else None
+    if len(data) < _PER_TERM * count:
+        return None
+    return Motion(data, window, equations, drawn or equations)
 
 
 def _equation(

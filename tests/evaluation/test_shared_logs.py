@@ -38,7 +38,7 @@ WANTED = {
     "12-unsigned-16-bit": "unsigned register of 16 bits",
     "13-action-is-the-next-state": [r"stop: .*'tau1' is 'q1' of the next row.*The same: tau2"],
     "14-zeros-at-the-start": ["q jumps after the first 3 rows"],
-    "15-saturated-drive": [r"'tau1' is a command .*about (3|3\.1) Nm act.*The same: tau2"],
+    "15-saturated-drive": [r"'tau1' is a command .*about (3|3\.1|3\.2) Nm act.*The same: tau2"],
     "16-torque-clock-fast": [r"the clock of input 'tau1' drifts by 0\.5 %"],
     "17-velocity-late": ["'v1' is 50 ms behind the derivative of 'q1'.*The same: q2, v2"],
     "18-clean-hard-motion": [],
