@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pinn_dyn.data.logs import DelayCurve, input_delays
+from pinn_dyn.log_check.delay import DelayCurve, input_delays
 from tests.support.delayed_robots import log, seven_regressor
 
 SAMPLE = 0.01

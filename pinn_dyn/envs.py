@@ -19,6 +19,7 @@ from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.c_draws import LoopOfDraws
 from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.exports.compiled import Function
+from pinn_dyn.exports.watch import Watch
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.run.run import Run
@@ -44,7 +45,8 @@ _SAMPLES = 200  # states per trajectory
 class ModelPlant(Plant):
     """K copies of a learned robot, integrated as in its training; inputs are zero before the start.
 
-    A loop in C is used as soon as it pays off, see :class:`~pinn_dyn.exports.c_loop.CLoop`.
+    A loop in C is used as soon as it pays off, see :class:`~pinn_dyn.exports.c_loop.CLoop`. Changes
+    of the model count from the next start on.
 
     Args:
         model: the learned system.
@@ -65,13 +67,22 @@ class ModelPlant(Plant):
         threads: PositiveInt = 1,
     ):
         self.num_coordinates, self.num_inputs = model.num_coordinates, model.num_inputs
-        self._models = [model_for_rollouts(x) for x in draws or [model]]
-        self._model, self._step, self._threads = self._models[0], step, threads
+        self._originals = [*(draws or [model])]
+        self._step, self._threads = step, threads
         self._delay = torch.zeros(model.num_inputs) if delay is None else delay
+        self._copy()
+
+    def _copy(self) -> None:
+        """Copy the models with their present numbers and attributes."""
+        self._watch = Watch(*self._originals)
+        self._models = [model_for_rollouts(x) for x in self._originals]
+        self._model = self._models[0]
         self._loop: Function | None = None
         self._has_draws_in_c = True
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
+        if self._watch.changed():
+            self._copy()
         self._x = self._states(q0, v0, torch.ones(len(q0)).bool())
         self._inputs = [q0.new_zeros(len(q0), self.num_inputs)]
         self._loop = self._ready()
@@ -262,8 +273,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold an input ``(M,)``, clipped to its limits, for one step."""
-        space = self.action_space
-        u = np.minimum(np.maximum(action, space.low), space.high).astype(float)
+        u = _clipped(action, self.action_space)
         motion = self.plant.advance(torch.from_numpy(u)[None], self.dt)
         state = np.concatenate([x[0].numpy() for x in motion])
         diverged = not np.isfinite(state).all()
@@ -294,9 +304,10 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     r"""K robots that are integrated side by side, with the interface of Gymnasium.
 
     Each robot is a :class:`RobotEnv`, with the same observations, rewards and ends. Episodes end at
-    different times. A robot starts a new one in the step after its last, or at once with
-    ``AutoresetMode.SAME_STEP``, where ``infos["final_obs"]`` holds the last observation.
-    ``distances()`` returns the distances from the training data.
+    different times. A robot starts a new one in the step after its last; at once with
+    ``AutoresetMode.SAME_STEP``, where ``infos["final_obs"]`` holds the last observation; or at the
+    call of ``reset(options={"reset_mask": mask})`` with ``AutoresetMode.DISABLED``. ``distances()``
+    returns the distances from the training data.
 
     Args:
         robot: a run or its folder, or a :class:`ModelPlant`.
@@ -312,6 +323,9 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         TypeError: on another robot, if ``data`` is missing, or for ``draws`` without a run.
     """
 
+    action_space: gymnasium.spaces.Box
+    _is_over: np.ndarray
+
     def __init__(
         self,
         robot: Run | ModelPlant | str | Path,
@@ -325,7 +339,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         u_high: Sequence[float] | None = None,
         draws: Sequence[MechanicalSystem] | None = None,
         threads: PositiveInt = 1,
-        autoreset: AutoresetMode = AutoresetMode.NEXT_STEP,
+        autoreset: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ):
         setup = _Setup(robot, data, step, (u_low, u_high), draws, threads)
         if not isinstance(setup.plant, ModelPlant):
@@ -340,19 +354,33 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         )
         self.reward, self.steps = reward, max(1, round(duration / self.dt))
         self._starts = setup.q.numpy(), setup.v.numpy()
-        self.single_action_space = self._inputs = setup.inputs
+        self.single_action_space = setup.inputs
         self.single_observation_space = setup.observations(has_goal=reward is None)
-        self.action_space = gymnasium.vector.utils.batch_space(setup.inputs, num_envs)
+        spaces = gymnasium.vector.utils.batch_space(setup.inputs, num_envs)
+        self.action_space = cast(gymnasium.spaces.Box, spaces)
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, num_envs
         )
-        self.metadata = {"autoreset_mode": autoreset}
+        self.metadata = {"autoreset_mode": AutoresetMode(autoreset)}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode of each robot in a drawn state of the training data."""
+        """Start an episode of each robot in a drawn state of the training data.
+
+        With ``options={"reset_mask": mask}``, a mask ``(K,)``, all other robots go on.
+        """
         super().reset(seed=seed)
+        mask = None if options is None else options.get("reset_mask")
+        if mask is not None:
+            if np.shape(mask) != (self.num_envs,) or mask.dtype != bool or not mask.any():
+                raise ValueError(
+                    f"reset_mask is {mask}, expected a bool array ({self.num_envs},) that is not "
+                    "all False"
+                )
+            self._restart(mask)
+            self._is_over = self._is_over & ~mask
+            return self._observations(), {}
         self._q, self._v, self._goal = self._drawn(self.num_envs)
         self.plant.start(torch.from_numpy(self._q), torch.from_numpy(self._v))
         self._count = np.zeros(self.num_envs, dtype=int)
@@ -363,8 +391,13 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold inputs ``(K, M)``, clipped to their limits, for one step."""
-        ended = self._is_over
-        u = np.clip(actions, self._inputs.low, self._inputs.high).astype(float)
+        mode, ended = self.metadata["autoreset_mode"], self._is_over
+        if mode == AutoresetMode.DISABLED and ended.any():
+            raise gymnasium.error.ResetNeeded(
+                f"the episodes of {ended.sum()} robots have ended: start them again by "
+                'reset(options={"reset_mask": terminated | truncated})'
+            )
+        u = _clipped(actions, self.action_space)
         q, v = (x.numpy() for x in self.plant.advance(torch.from_numpy(u), self.dt))
         diverged = ~(np.isfinite(q).all(1) & np.isfinite(v).all(1)) & ~ended
         self._q, self._v = (
@@ -383,7 +416,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         truncated = self._count >= self.steps
         self._is_over = diverged | truncated
         infos: dict[str, Any] = {}
-        if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP and self._is_over.any():
+        if mode == AutoresetMode.SAME_STEP and self._is_over.any():
             infos = {"final_obs": self._observations(), "_final_obs": self._is_over}
             self._restart(self._is_over)
             self._is_over = np.zeros_like(diverged)
@@ -408,6 +441,13 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     def _observations(self) -> np.ndarray:
         parts = [self._q, self._v, self._goal] if self.reward is None else [self._q, self._v]
         return np.concatenate(parts, axis=1)
+
+
+def _clipped(action: np.ndarray, space: gymnasium.spaces.Box) -> np.ndarray:
+    """Return an action within the limits of its space; refuse another shape."""
+    if np.shape(action) != space.shape:
+        raise ValueError(f"the action has the shape {np.shape(action)}, expected {space.shape}")
+    return np.minimum(np.maximum(action, space.low), space.high).astype(float)
 
 
 gymnasium.register("pinn_dyn/Robot-v0", entry_point="pinn_dyn.envs:RobotEnv")

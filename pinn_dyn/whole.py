@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ _LARGEST = 2**26
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Replace a file only by a complete one, even if the writer is killed or fails.
+    """Replace a file or an empty folder only by a complete one, also if the writer is killed.
 
     Yields:
         Path of ``<name>.<process>.partial`` to write to; it is moved into place afterwards.
@@ -31,6 +32,8 @@ def whole(path: Path) -> Iterator[Path]:
             error.filename = str(path)
         raise
     finally:
+        if partial.is_dir():
+            shutil.rmtree(partial)
         partial.unlink(missing_ok=True)
 
 

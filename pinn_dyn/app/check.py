@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from pinn_dyn.data import LogSource
 from pinn_dyn.log_check.check import LogCheck
 from pinn_dyn.log_check.check import check as check_log
 from pinn_dyn.log_check.structure import SCALE
+from pinn_dyn.models.structure import Structure
 from pinn_dyn.run.build import ConfigError, build_part, build_source, naming
-from pinn_dyn.run.known_data import match_structure
+from pinn_dyn.run.known_data import joints_of, match_structure
 from pinn_dyn.run.program import command_line
 from pinn_dyn.run.run_folder import write_config
 from pinn_dyn.systems import RigidChain
@@ -39,38 +41,51 @@ def check(cfg: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
-    if structure is not None:
-        options = [option for option in report.options if "friction" not in option]  # the default
-        options += _gains(report) if "model/input=servo" not in options else []
-        print(f"a training of its constants: {_training(options, True)}")
-    elif report.options and report.model == "oscillators":
-        print(f"a training: {_training(report.options)}")
-        print("the modes, a control law and C code follow: docs/soft_robots.md")
-    elif report.options:
-        names = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
-        effects = " and ".join(names[option] for option in report.options if option in names)
-        print(f"a training with {effects}: {_training(report.options)}")
-        print(
-            "with a URDF, model=known with these options is often better: docs/known_mechanics.md"
-        )
+    if not report.problems:
+        _print_commands(report, structure)
     if report.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")
 
 
-def _gains(report: LogCheck) -> list[str]:
-    """Return the options for inputs that are no forces, with the gains that the URDF suggests."""
-    units = report.source.u.units
+def _print_commands(report: LogCheck, structure: Structure | None) -> None:
+    """Print the commands of a training on this data set."""
+    if structure is not None:
+        options = [x for x in report.candidates[0][1] if "friction" not in x]  # the default
+        options = [x for x in options if not x.startswith("model=")]
+        options += _gains(report, structure) if "model/input=servo" not in options else []
+        print(f"a training of its constants: {_training(['experiment=known', *options], True)}")
+        return
+    for reason, options in report.candidates:
+        print(f"a training, {reason}: {_training(options)}")
+        if "experiment=oscillators" in options:
+            print("the modes, a control law and C code follow: docs/soft_robots.md")
+        elif "model=lnn" in options:
+            text = "with a URDF, model=known with these options is often better:"
+            print(f"{text} docs/known_mechanics.md")
+
+
+def _gains(report: LogCheck, structure: Structure) -> list[str]:
+    """Return the options for the joints that the inputs drive, and for inputs that are no forces.
+
+    The gains are those that the masses of the URDF suggest. A joint without a clear one gets the
+    median gain.
+    """
+    names, units = getattr(structure, "joint_names", []), report.source.u.units
+    options = []
+    if report.driven:
+        driven = joints_of(report.source.u.columns, names) or [names[k] for k in report.driven]
+        options.append(f"model.driven_joints=[{','.join(driven)}]")
     if set(units) <= {"Nm", "N"}:
-        return []
-    scales = np.array([x.value for x in report.measurements if x.name == SCALE])
-    clear = scales[scales > 0]
-    usual = 1 / float(np.median(clear)) if len(clear) else 10.0
-    gains = [1 / x if x > 0 else usual for x in scales.tolist()] or [usual] * len(units)
+        return options
+    scales = {x.place: x.value for x in report.measurements if x.name == SCALE and x.value > 0}
+    usual = 1 / float(np.median([*scales.values()])) if scales else 10.0
+    driven = [names[k] for k in report.driven] or names[: len(units)]
+    gains = [1 / scales[x] if x in scales else usual for x in driven]
     values = ",".join(f"{gain:.2g}" for gain in gains)
-    return [f"model.drive_gain=[{values}]", "model.gain_spread=0.5"]
+    return [*options, f"model.drive_gain=[{values}]", "model.gain_spread=0.5"]
 
 
-def _training(options: list[str], with_structure: bool = False) -> str:
+def _training(options: Sequence[str], with_structure: bool = False) -> str:
     """Return the command that trains a model on this data set, for a shell.
 
     The command identifies the structure that the check was called with, if ``with_structure``.
@@ -83,8 +98,4 @@ def _training(options: list[str], with_structure: bool = False) -> str:
     parts.insert(parts[:1] == ["python"], str(name))
     if not any(x.startswith("dataset=") for x in parts):
         parts.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
-    if with_structure:
-        options = ["experiment=known", *options]
-    elif "experiment=oscillators" not in options:
-        options = ["model=lnn", *options]
     return shlex.join([*parts, *options])

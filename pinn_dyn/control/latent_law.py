@@ -30,7 +30,8 @@ class LatentLaw(Stage):
         q(u_d) = q_s - d,    z_d = z(u_d),    z_d' = H^-1 F J^+ v_ref,    J = dq/du
         dq_s/dt = v_ref + max(K_I, 0.2/T) (q_ref - q_s),    q_s = q before the first call
 
-    q(u) and z(u) are the equilibrium of the model under a constant input u. F = df/du at u_d and
+    Inputs are constant over a period, f(u, 0). q(u) and z(u) are the equilibrium of the model under
+    a constant input u. F = df/du at u_d and
     the Hessian H of the potential belong to z_d. Inputs are divided by their standard deviations S
     in the data. The feedback is collocated: F^T z' does the work of the inputs, and C^+ is positive
     semi-definite. z and z' are the means of the coming period, which follow from u, so that the

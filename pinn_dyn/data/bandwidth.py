@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
+_SEGMENT = 100  # samples of a spectrum, at least
+_FALSE = 0.01  # chance that white noise counts as a signal
 _ROUND = [x * 10.0**k for k in (-3, -2, -1) for x in (1, 2, 5)]  # s
 _SLOWEST = 0.1  # Hz, of an input that sets the step
 _COARSER = 2.5  # round time over a tenth of the period, at most
@@ -20,27 +22,43 @@ def bandwidth(signals: Sequence[np.ndarray], step: float, noise: np.ndarray) -> 
         step: sample time, s.
         noise: standard deviation of their noise, ``(K,)``, which does not count.
     """
-    size = min(round(8 / step), min(map(len, signals)))
+    size = min(max(round(8 / step), _SEGMENT), min(map(len, signals)))
     spectra = [scipy.signal.welch(x, 1 / step, nperseg=size, axis=0) for x in signals]
     f, density = spectra[0][0], np.mean([power for _, power in spectra], axis=0)
-    # White noise has 2 s² h per Hz. Power up to four times this level counts as noise.
-    level = np.maximum(2 * noise**2 * step, np.median(density[len(f) // 2 :], axis=0))
-    power = np.where(density > 4 * level, density, 0.0) * f[:, None] ** 2
+    # White noise has 2 s² h per Hz. Its estimate is the mean of squares of independent pieces.
+    pieces = max(sum(len(x) // size for x in signals), 1)
+    chances = np.array([0.5, 1 - _FALSE / len(f)])
+    middle, highest = scipy.stats.chi2.ppf(chances, 2 * pieces) / (2 * pieces)
+    level = np.median(density[len(f) // 2 :], axis=0) / middle
+    level = np.maximum(2 * noise**2 * step, level)
+    above = np.where(density > highest * level, density - level, 0.0)
+    power = above * f[:, None] ** 2
     share = np.cumsum(power, axis=0) / power.sum(axis=0).clip(min=1e-300)
     return max((float(f[np.searchsorted(x, 0.99)]) for x in share.T if x[-1] > 0), default=0.0)
+
+
+def hold_of(signals: Sequence[np.ndarray]) -> int:
+    """Return the median number of samples over which signals ``(T, K)`` keep their values."""
+    changes = [np.flatnonzero((np.diff(x, axis=0) != 0).any(axis=1)) for x in signals]
+    lengths = np.concatenate([np.diff(x) for x in changes])
+    return int(np.median(lengths)) if len(lengths) else 1
 
 
 def samples_in_step(signals: Sequence[list[np.ndarray]], step: float) -> int:
     """Return the samples in about a tenth of a period of the slower kind of signal, a round time.
 
     Measured coordinates have noise and inputs may jump, so the slower of both tells how fast the
-    motion is.
+    motion is. Of signals that are held between their samples, one sample per hold counts.
 
     Args:
         signals: inputs and coordinates of each run, ``(T, K)``.
         step: sample time, s.
     """
-    fastest = [bandwidth(x, step, np.zeros(x[0].shape[1])) for x in signals]
+    fastest = []
+    for kind in signals:
+        hold = hold_of(kind)
+        kept = [x[::hold] for x in kind]
+        fastest.append(bandwidth(kept, hold * step, np.zeros(kept[0].shape[1])))
     # White signals have no bandwidth above their noise.
     longest = 0.1 / max(min([x for x in fastest if x > 0], default=0.5 / step), _SLOWEST)
     usual = [x for x in _ROUND if 0.99 <= x / longest <= _COARSER]

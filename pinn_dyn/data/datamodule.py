@@ -31,7 +31,8 @@ class DynamicsData:
             of the longest trajectory if that is shorter.
         stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``, or
             ``"about 20 ms"``, which is rounded to whole samples. ``"auto"`` is about a tenth of a
-            period of the fastest input, or of the fastest motion if that is slower.
+            period of the fastest input, or of the fastest motion if that is slower, without noise
+            and holds of the inputs.
         batch_size: windows in a batch.
         batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.

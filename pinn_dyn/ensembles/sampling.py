@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants
+from pinn_dyn.models.known_constants import Constants, PhysicalBodies, PositiveConstants
 
 _STEPS_PER_DIMENSION = 10
 _MARGIN = 0.999  # of the way to the border of what is possible
@@ -24,11 +24,12 @@ def sampled_models(model: Predictor, covariance: Tensor, count: int, seed: int) 
 
         J = J_fit + (dJ/dz) e,   c = c_fit + (dc/dz) e,   e ~ N(0, C),   J > 0,   c > 0
 
-    In directions that the data do not determine, C is the covariance of the prior. So draws keep
-    all forces that the data determine, also where the prior is wide, and every body has a positive
-    density. A hit-and-run sampler draws them: along a random direction, e is normal on the interval
-    of what is possible. Source: Smith 1984, Efficient Monte Carlo procedures for generating points
-    uniformly distributed over bounded regions.
+    The common factor of all masses and forces is drawn in its logarithm instead of e, because data
+    with learned drive gains do not determine it. In directions that the data do not determine, C is
+    the covariance of the prior. So draws keep all forces that the data determine, also where the
+    prior is wide, and every body has a positive density. A hit-and-run sampler draws them: along a
+    random direction, e is normal on the interval of what is possible. Source: Smith 1984, Efficient
+    Monte Carlo procedures for generating points uniformly distributed over bounded regions.
 
     Args:
         model: model with the fitted z.
@@ -42,9 +43,17 @@ def sampled_models(model: Predictor, covariance: Tensor, count: int, seed: int) 
     model = copy.deepcopy(model).double().requires_grad_(False)
     z = parameters_to_vector(model.parameters())
     limits = _Limits(model, len(z))
-    noise = _possible(limits, torch.linalg.cholesky(covariance.double()), count, seed)
+    root = torch.linalg.cholesky(covariance.double())
+    common = limits.log_factor + limits.factor * z  # dz by the logarithm of the common factor
+    rise = torch.linalg.solve_triangular(root, common[:, None], upper=False)
+    size = rise.norm().clamp(min=1e-9)
+    root = root @ (torch.eye(len(z)).to(z) - rise @ rise.T / size**2)
+    generator = torch.Generator().manual_seed(seed)
+    noise = _possible(limits, root, count, generator)
+    factor = torch.randn(count, 1, generator=generator).to(z) / size
+    shifted = limits.parameters_of(z, noise)
     models = []
-    for values in limits.parameters_of(z, noise):
+    for values in shifted * torch.exp(limits.factor * factor) + limits.log_factor * factor:
         member = copy.deepcopy(model)
         vector_to_parameters(values, member.parameters())
         models.append(member)
@@ -52,22 +61,35 @@ def sampled_models(model: Predictor, covariance: Tensor, count: int, seed: int) 
 
 
 class _Limits:
-    """Limits of a shift e ``(*batch, P)`` of the parameters, linear in bodies and constants."""
+    """Limits of a shift e ``(*batch, P)`` of the parameters, linear in bodies and constants.
+
+    A common factor s of all masses and forces multiplies z by s to the power of ``factor``, and
+    adds ``log_factor`` log s.
+    """
 
     def __init__(self, model: nn.Module, size: int):
         self.rate = torch.zeros(size, dtype=torch.float64)  # of positive constants, relative
+        self.factor, self.log_factor = self.rate.clone(), self.rate.clone()
         self.bodies: list[tuple[PhysicalBodies, slice, Tensor]] = []
         positions, first = {}, 0
         for parameter in model.parameters():
             positions[id(parameter)] = slice(first, first + parameter.numel())
             first += parameter.numel()
         for part in model.modules():
+            if not isinstance(part, Constants):
+                continue
+            where = positions[id(part.z)]
+            forces = torch.tensor(["N" in unit or "kg" in unit for unit in part.units]).double()
             if isinstance(part, PositiveConstants):
-                self.rate[positions[id(part.z)]] = part.spread
+                self.rate[where], self.log_factor[where] = part.spread, forces / part.spread
             elif isinstance(part, PhysicalBodies):
                 slopes = torch.func.jacrev(part.inertia_of)(part.z)
-                item = part, positions[id(part.z)], slopes.reshape(-1, part.z.numel())
-                self.bodies.append(item)
+                self.bodies.append((part, where, slopes.reshape(-1, part.z.numel())))
+                scale = torch.zeros_like(part.z)
+                scale[:, :1] = 0.5 / part.spread
+                self.log_factor[where] = scale.flatten()
+            else:
+                self.factor[where] = forces
 
     def inertias(self, shift: Tensor) -> list[Tensor]:
         """Return the change of J of each group of bodies, ``(*batch, n, 4, 4)``."""
@@ -99,9 +121,8 @@ class _Limits:
         return values
 
 
-def _possible(limits: _Limits, root: Tensor, count: int, seed: int) -> Tensor:
+def _possible(limits: _Limits, root: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return e = R w with w ~ N(0, I), restricted to the limits, ``(count, P)``."""
-    generator = torch.Generator().manual_seed(seed)
     w = torch.zeros(count, len(root), dtype=torch.float64)
     for _ in range(_STEPS_PER_DIMENSION * len(root)):
         direction = torch.randn(w.shape, generator=generator).to(w)

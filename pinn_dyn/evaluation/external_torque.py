@@ -28,6 +28,8 @@ _FEWEST_BLOCKS = 10
 _STARTING = 3.0  # time constants after which the observer has forgotten its start
 _SINGULAR = 0.05  # smallest over largest singular value of the Jacobian of an ambiguous wrench
 _DAMPING = 0.01  # in units of the largest singular value
+_SMALLEST = 1e-6  # largest singular value of a Jacobian of zero, in mean link lengths
+_QUIET = 0.25  # share of the samples in motion that are quiet in any frame
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,16 +46,19 @@ class ExternalTorque:
         contacts: a row per contact: run, start and end in s, the joint that exceeds its threshold
             most, and the largest external torque of this joint.
         bandwidth: K_O of the observer, 1/s.
+        doubtful: runs whose quiet part does not fit the model, see :func:`quiet_level`.
     """
 
     table: pd.DataFrame
     threshold: pd.Series
     contacts: pd.DataFrame
     bandwidth: float
+    doubtful: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         levels = ", ".join(f"{joint}: {value:.3g}" for joint, value in self.threshold.items())
-        return f"ExternalTorque({len(self.contacts)} contacts, thresholds {levels})"
+        doubt = f", doubtful: {', '.join(self.doubtful)}" if self.doubtful else ""
+        return f"ExternalTorque({len(self.contacts)} contacts, thresholds {levels}{doubt})"
 
     def figure(self, run: str | None = None) -> Figure:
         """Draw the torques of a run, the first by default, with thresholds and contacts."""
@@ -104,8 +109,23 @@ def observed_torques(
     return residual, drive[0] + torch.from_numpy(filtered)
 
 
+def settled(residual: Tensor, step: float, bandwidth: float) -> Tensor:
+    """Return |r| after the start of the observer, ``(T, N)``."""
+    return residual[math.ceil(_STARTING / (bandwidth * step)) :].abs()
+
+
+def quiet_level(sizes: Tensor, threshold: np.ndarray) -> float:
+    """Return the ratio to the thresholds that |r| of a quarter of the moving samples stays below.
+
+    It compares a frame with contacts to quiet motion, as long as they are no longer than three
+    quarters of the frame.
+    """
+    ratios = (sizes / torch.from_numpy(threshold)).amax(dim=1)
+    return float(np.quantile(ratios[ratios > 0], _QUIET)) if ratios.any() else 0.0
+
+
 def contact_thresholds(
-    model: MechanicalSystem, quiet: Sequence[Trajectory], bandwidth: float, false_alarms: float
+    quiet: Sequence[Tensor], step: float, bandwidth: float, false_alarms: float
 ) -> np.ndarray:
     """Return the level of |r| of each joint that quiet motion exceeds rarely, ``(N,)``.
 
@@ -118,20 +138,17 @@ def contact_thresholds(
     Source: Gumbel 1958, Statistics of Extremes.
 
     Args:
-        model: the model.
-        quiet: motions without a contact that the model was not fitted to.
+        quiet: |r| of motions without a contact that the model was not fitted to, :func:`settled`.
+        step: sample time, s.
         bandwidth: K_O, 1/s.
         false_alarms: expected false alarms of all joints in an hour of such motion.
 
     Raises:
         ValueError: if the motions are too short for ten blocks.
     """
-    blocks = []
-    for motion in quiet:
-        step = float(motion.t[1] - motion.t[0])
-        length, start = math.ceil(_BLOCK / (bandwidth * step)), _STARTING / (bandwidth * step)
-        size = observed_torques(model, motion, bandwidth)[0][math.ceil(start) :].abs()
-        blocks += [part.amax(0) for part in size.split(length) if len(part) == length]
+    length = math.ceil(_BLOCK / (bandwidth * step))
+    parts = [part for sizes in quiet for part in sizes.split(length)]
+    blocks = [part.amax(0) for part in parts if len(part) == length]
     if len(blocks) < _FEWEST_BLOCKS:
         raise ValueError(
             f"the quiet motions have {len(blocks)} stretches of {_BLOCK / bandwidth:.2g} s, "
@@ -196,9 +213,10 @@ def link_wrench(
     scale = torch.tensor([1.0] * 3 + [chain._usual_length()] * 3).to(q)[:size]
     J = chain.tip_jacobian(q)[..., :size, :] * scale[:, None]
     U, S, V = torch.linalg.svd(J, full_matrices=False)
-    damped = S / (S**2 + (_DAMPING * S[..., :1]) ** 2)
+    largest = S[..., :1].clamp(min=_SMALLEST * chain._usual_length())
+    damped = S / (S**2 + (_DAMPING * largest) ** 2)
     wrench = U @ (damped * (V @ torque[..., None])[..., 0])[..., None]
-    ambiguous = S[..., -1] < _SINGULAR * S[..., 0]
+    ambiguous = S[..., -1] < _SINGULAR * largest[..., 0]
     if J.shape[-1] < size:
         ambiguous = torch.ones_like(ambiguous)
     return wrench[..., 0] * scale, ambiguous

@@ -18,7 +18,7 @@ import torch
 
 from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.escaping import c_text
-from pinn_dyn.exports.exported import Calls, ExportedFunction, Real, identifier
+from pinn_dyn.exports.exported import DTYPES, Calls, ExportedFunction, Real, identifier
 from pinn_dyn.exports.program import Program
 from pinn_dyn.exports.scalar_code import CBody, c_function
 
@@ -129,7 +129,11 @@ def _signature(function: str, program: Program, name: str, real: Real) -> str:
 
 def find_compiler() -> list[str] | None:
     """Return the command of the C compiler, which CC may set with options, or None without one."""
-    commands = [shlex.split(name) for name in _compilers()]
+    try:
+        commands = [shlex.split(name) for name in _compilers()]
+    except ValueError as error:
+        text = f"CC is {os.environ['CC']!r}, expected the command of a C compiler: {error}"
+        raise ValueError(text) from error
     return next((words for words in commands if shutil.which(words[0])), None)
 
 
@@ -202,7 +206,7 @@ def _pointers(array: str, shapes: Mapping[str, torch.Size]) -> dict[str, str]:
 def _call(
     path: Path, function: str, program: Program, real: Real
 ) -> Callable[..., Sequence[np.ndarray]]:
-    dtype = np.float64 if real == "double" else np.float32
+    dtype = DTYPES[real]
     ends = [*accumulate(map(torch.Size.numel, program.outputs.values()))]
 
     def call(*inputs: np.ndarray) -> Sequence[np.ndarray]:

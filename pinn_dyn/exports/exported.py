@@ -6,6 +6,8 @@ import importlib
 import json
 import os
 import re
+import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -32,7 +34,9 @@ Ranges = Mapping[str, tuple[Tensor, Tensor]]
 """Smallest and largest values of inputs by name, for the states of the comparison."""
 
 TOLERANCES = {"double": 1e-9, "float": 1e-4}
+DTYPES = {"double": np.float64, "float": np.float32}
 STATES = 200
+_TEMPORARY, _DAY = ".export-", 86_400.0  # s
 _WRITERS = {
     ".c": "pinn_dyn.exports.c_file:write_c",
     ".onnx": "pinn_dyn.exports.onnx_file:write_onnx",
@@ -89,15 +93,17 @@ class ExportedFunction:
         function = partial(self.function, model=calling)
         return {"part": part, self.name: trace(function, example, self.outputs)}
 
-    def compare(self, call: Call, tolerance: float) -> None:
-        """Compare with a function of the file.
+    def compare(self, call: Call, real: Real) -> None:
+        """Compare with a function of the file, whose numbers have the type ``real``.
 
         A difference is relative to the norm of the output at the state, or to the RMS of the norms
         over all states if this is larger.
 
         Raises:
-            RuntimeError: if a difference exceeds the tolerance.
+            RuntimeError: if a difference exceeds the tolerance of the type, the file returns
+                another type, or no value of the original is finite.
         """
+        tolerance = TOLERANCES[real]
         states = [*zip(*self.inputs.values(), strict=True)]
         with torch.no_grad():
             rows = [self.function(*state) for state in states]
@@ -109,6 +115,12 @@ class ExportedFunction:
             values = torch.stack(expected).reshape(len(states), -1).numpy()
             results = np.reshape(column, values.shape)
             finite = np.isfinite(values).all(-1)
+            if results.dtype != DTYPES[real] or not finite.any():
+                raise RuntimeError(
+                    f"{self.name}: {output} has {finite.sum()} finite values of {len(finite)} and "
+                    f"is {results.dtype} in the file, expected {real}: no file is written; check "
+                    "the constants of the model and the writer of this format"
+                )
             norms = np.linalg.norm(values, axis=-1)
             scale = np.fmax(norms, np.sqrt(np.mean(norms[finite] ** 2)) if finite.any() else 0.0)
             error = np.linalg.norm(results - values, axis=-1) / np.where(scale > 0, scale, 1)
@@ -149,14 +161,17 @@ def write(
     path.parent.mkdir(parents=True, exist_ok=True)
     version = importlib.import_module("pinn_dyn").__version__
     text = json.dumps({"pinn_dyn": version, "real": real, **info}, default=listed)
+    for old in path.parent.glob(f"{_TEMPORARY}*"):  # of programs that were killed
+        if time.time() - old.stat().st_mtime > _DAY:
+            shutil.rmtree(old, ignore_errors=True)
     # Written beside its place and then moved: a failure leaves the previous file, or none.
-    with TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
+    with TemporaryDirectory(dir=path.parent, prefix=_TEMPORARY) as folder:
         partial = Path(folder) / path.name
         calls: Calls = getattr(importlib.import_module(module), writer)(
             functions, partial, text, real
         )
         for function in functions if calls else ():
-            function.compare(calls[function.name], TOLERANCES[real])
+            function.compare(calls[function.name], real)
         for file in (partial.with_suffix(".h"), partial):
             if file.exists():
                 os.replace(file, path.parent / file.name)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, fx
 
-from pinn_dyn.exports.exported import Calls, ExportedFunction, Real
+from pinn_dyn.exports.exported import DTYPES, Calls, ExportedFunction, Real
 from pinn_dyn.exports.program import MOVES, moved, operation, unsupported
 
 OPSET = 18
@@ -50,7 +50,7 @@ def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, rea
             f"{path.name} needs {error.name}: pip install 'pinn_dyn[onnx]'"
         ) from error
     (function,) = functions
-    writer = _OnnxWriter(onnx.helper, np.float64 if real == "double" else np.float32)
+    writer = _OnnxWriter(onnx.helper, DTYPES[real])
     graph = writer.graph(function)
     opset = onnx.helper.make_opsetid("", OPSET)
     model = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -18,9 +19,14 @@ from pinn_dyn.models.known import INERTIAL
 from pinn_dyn.models.known_constants import Named, RealConstants
 from pinn_dyn.systems.inertia import central_parameters, inertial_parameters, pseudo_inertia
 from pinn_dyn.training import LeastSquares
+from pinn_dyn.training.filtered_motion import filtered_motion
+from pinn_dyn.training.least_squares import REST
 
 _NAMES = ("mass", "center x", "center y", "center z", *INERTIAL[4:])
 _UNITS = ("kg", *3 * ["m"], *6 * ["kg m^2"])
+_DOUBT = 2.5  # RMS ratio of the unexplained shares of the torques, with the load over without it
+
+log = logging.getLogger(__name__)
 
 
 def identify_payload(
@@ -38,11 +44,14 @@ def identify_payload(
     lambda is 1 with the load, and k the body that carries it. pi_load has no physical limits, so
     that the interval of a missing load contains zero. The drives must have the same friction with
     and without the load. A number is not determined if the data removed less than half of its prior
-    variance, which is that of a load as heavy as the arm. Source: Swevers, Verdonck and De Schutter
-    (2007), "Dynamic model identification for industrial robots", IEEE Control Systems 27(5).
+    variance, which is that of a load as heavy as the arm. All numbers are contradicted if the mass
+    is clearly negative, or if the fitted model with any load leaves more than 2.5 times the share
+    of the torques of the loaded motions unexplained than of the others. Source: Swevers, Verdonck
+    and De Schutter (2007), "Dynamic model identification for industrial robots", IEEE Control
+    Systems 27(5).
 
     Args:
-        model: known mechanics, fitted or not. It is not changed.
+        model: known mechanics, fitted to the motions without the load. It is not changed.
         without, loaded: motions without and with the load.
         cutoff: cutoff of the filter, Hz, see :class:`~pinn_dyn.training.LeastSquares`.
         samples: number of samples.
@@ -74,6 +83,9 @@ def identify_payload(
     columns = {"value": values, "low": values - width, "high": values + width}
     table = pd.DataFrame({"name": _NAMES} | {k: x.numpy() for k, x in columns.items()})
     table["unit"], table["determined"] = _UNITS, np.where(determined, "yes", "not determined")
+    if doubt := _doubt(model, without, loaded, table.high[0], cutoff, samples):
+        table["determined"] = "contradicted"
+        log.warning("the load is contradicted: %s", doubt)
     table.attrs["frame"] = joint.frame
     return table
 
@@ -138,6 +150,47 @@ class _Samples:
 
     def by_parameters(self) -> Tensor:
         return torch.cat([self.known.by_parameters(), self.rows], dim=-1)
+
+
+def _doubt(
+    model: KnownMechanics,
+    without: Sequence[Trajectory],
+    loaded: Sequence[Trajectory],
+    heaviest: float,
+    cutoff: float,
+    samples: int,
+) -> str:
+    """Return what contradicts a load of at most a mass in kg, "" if nothing does."""
+    robot = _LoadedRobot(double_copy(model))
+    before, after = (_unexplained(robot, x, cutoff, samples) for x in (without, loaded))
+    ratios = (after / before).nan_to_num(0.0)  # a passive joint has no torque
+    name, ratio = (
+        model.structure.joint_names[int(ratios.argmax())],
+        float(ratios.square().mean().sqrt()),
+    )
+    if ratio > _DOUBT:
+        return (
+            f"no load explains {ratio:.2g} times the share of the torques that is unexplained "
+            f"without a load, most at {name}; compare signs, units, order, zero positions and "
+            "clocks of the columns with those of the training"
+        )
+    text = "its mass is at most {:.3g} kg: are the motions with and without the load exchanged?"
+    return text.format(heaviest) if heaviest < 0 else ""
+
+
+def _unexplained(
+    robot: _LoadedRobot, runs: Sequence[Trajectory], cutoff: float, samples: int
+) -> Tensor:
+    """Return the share of each torque that the model and the best load leave, ``(N,)``."""
+    motion = filtered_motion([_marked(run, 1.0) for run in runs], cutoff, samples)
+    at = robot.samples(*motion)
+    moves = motion.v.abs() > REST * motion.v.std(0)
+    with torch.no_grad():
+        force, rows = at.missing_force() * moves, at.rows * moves[..., None]
+        drive = robot.known.motor_force(motion.q, motion.v, motion.u[:, :-1]) * moves
+    flat = rows.flatten(0, 1)
+    load = torch.linalg.lstsq(flat, -force.flatten()[:, None], driver="gelsd").solution
+    return (force + (rows @ load)[..., 0]).norm(dim=0) / drive.norm(dim=0)
 
 
 def _marked(run: Trajectory, load: float) -> Trajectory:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -14,14 +14,34 @@ from pydantic import PositiveFloat
 from pinn_dyn import wording
 from pinn_dyn.data import logs
 from pinn_dyn.data.bandwidth import bandwidth
-from pinn_dyn.data.logs.check.averages import white_noise
-from pinn_dyn.data.logs.check.delay import INTERVAL
-from pinn_dyn.data.logs.check.input_faults import input_faults
+from pinn_dyn.data.logs.check.holds import held_rows
+from pinn_dyn.data.logs.check.plausibility import LOST
 from pinn_dyn.data.logs.measurement import Measurement, judged
+from pinn_dyn.data.logs.recording import round_rate
 from pinn_dyn.identification.rigid_excitation import MOST, RigidExcitation, rigid_excitation
 from pinn_dyn.log_check import numbers
+from pinn_dyn.log_check.averages import (
+    Averages,
+    averages_of_widths,
+    compared,
+    parts_of,
+    white_noise,
+    with_products,
+)
+from pinn_dyn.log_check.delay import INTERVAL, DelayCurve, clear_delays, input_delays
+from pinn_dyn.log_check.equation import Regressor
+from pinn_dyn.log_check.input_faults import input_faults
+from pinn_dyn.log_check.numbers import check_angles, check_velocity_lag
 from pinn_dyn.log_check.page import LogCheck
-from pinn_dyn.log_check.structure import compare_structure, regressor
+from pinn_dyn.log_check.runs import (
+    Motion,
+    check_runs,
+    check_signs,
+    driven_joint,
+    equations_of_motion,
+)
+from pinn_dyn.log_check.stored import store, stored
+from pinn_dyn.log_check.structure import FIT, SCALE, compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure
 
@@ -30,14 +50,48 @@ _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a
 _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
 _OF_MOTORS = {"rad", "m", "Pa"}  # units of motor angles, lengths of tendons, and pressures
-# Settings that were the best on a real trunk, docs/what_we_tried.md.
+_FORCES = {"Nm", "N", "A", "V"}
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
 # Column of the table of coordinates, its upper limit, and the text beyond it.
 _LIMITS = (
     ("noise / range", _NOISE, "its noise is {:.2g} % of its range"),
     ("test outside", _OUTSIDE, "{:.3g} % of the test is outside the training range"),
 )
+_WRONG = "the robot of the URDF has other forces"  # reason why there is no delay
 _judged = partial(judged, section="docs/bags_and_other_logs.md#is-the-log-good-enough")
+
+
+def verdict(source: logs.LogSource, structure: Structure | None = None) -> list[str]:
+    """Return what is wrong with a log: of the last check of the same data and robot.
+
+    Without a check, a log with a structure is checked now; the result is empty for others.
+    """
+    texts = stored(source, _regressor(structure, len(source.u.columns)))
+    if texts is None and structure is not None:
+        check(source, structure=structure)
+        texts = stored(source, _regressor(structure, len(source.u.columns)))
+    return texts or []
+
+
+@dataclass
+class _Answers:
+    """Answers of the equation of motion to the questions about a log.
+
+    Attributes:
+        measurements: measurements.
+        curves: delay curve of each input.
+        clear: delay of each input that is clear, s; 0 for others.
+        held: rows for which the values of an input repeat, where its motion follows lines; else 1.
+        motion: averages and equations; None if the rows are too few.
+        driven: joint that each input drives, if there are fewer inputs than coordinates.
+    """
+
+    measurements: list[Measurement]
+    curves: list[DelayCurve]
+    clear: list[float]
+    held: list[int]
+    motion: Motion | None = None
+    driven: Sequence[int] = ()
 
 
 def check(
@@ -58,60 +112,175 @@ def check(
     """
     splits = source.load()
     inputs = len(source.u.columns)
-    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
-    training = [replace(item, u=item.u[:, :inputs]) for item in training]  # no rates of inputs
+    stretches = [
+        (x.split == "train", replace(item, u=item.u[:, :inputs]))  # no rates of inputs
+        for x in source.cleaned
+        for item in x.clean
+    ]
+    training = [item for is_training, item in stretches if is_training]
+    others = [item for is_training, item in stretches if not is_training]
     step = float(np.median(np.diff(training[0].t)))
-    square = structure is not None and structure.num_coordinates == inputs
-    rigid = regressor(structure) if structure is not None and square else None
-    delays = logs.input_delays(training, longest=longest_delay, rigid=rigid)
-    faults, delays = input_faults(training, delays, source.u, step, rigid)
-    everything = [item for x in source.cleaned for item in x.clean]
-    columns = source.q, source.u
-    motion, equations = logs.equations_of_motion(
-        everything, *columns, step, curves=delays, rigid=rigid
-    )
-    runs = logs.check_runs(everything, *columns, motion, equations, curves=delays, rigid=rigid)
-    # A fault of an input explains runs that differ, and signs.
-    runs = [] if any(x.verdict != "ok" for x in faults) else runs
-    before = [x for x in source.measurements if x.name not in {logs.RESIDUAL, logs.INERTIA}]
     coordinates = _coordinates(source, training, splits.test)
     noise = coordinates["noise of q"].to_numpy()
     highest = bandwidth([item.q for item in training], step, noise)
     servo = _follows_targets(source, training, step, longest_delay)
-    # The lag of a servo is no delay.
-    clear = [0.0] * inputs if servo else logs.clear_delays(delays, step)
-    measurements = [*before, *runs, *faults, *_limited(coordinates)]
-    measurements += _inputs_measured(source, training, delays, clear, step)
+    rows = max(held_rows(x.raw.q) for x in source.cleaned)
+    if rows == 1:
+        answers = _answers(source, training, others, step, longest_delay, structure, servo)
+    else:  # the acceleration of held values means nothing
+        answers = _Answers([_held(rows, step)], [], [0.0] * inputs, [rows] * inputs)
+    store(source, _regressor(structure, inputs), answers.measurements)
+    measurements = [*source.measurements, *answers.measurements, *_limited(coordinates)]
     excitation = None
     if structure is not None:
-        measurements += compare_structure(structure, training, delays, source.u, step)
         excitation = _excitation(structure, splits.train, coordinates, highest, step)
         measurements.append(_condition(excitation))
-    dry = any(x.dry for x in delays)
+    dry = any(x.dry for x in answers.curves)
+    steps = _lines(source, answers.held, rows, step)
     # A filter smears reversals of dry friction.
-    filtered = not (dry and source.v is not None)
+    if not steps and not (dry and source.v is not None):
+        steps = _filter(source, training, step, coordinates, highest)
     angles = [unit == "rad" for unit in source.q.units]
     fast = (coordinates["fastest [/s]"] * step > _TURNED)[angles].any()
-    options = ["model/input=servo", "model/integrator=rosenbrock"] * servo
-    options += ["model/friction=coulomb"] * dry
-    motors = structure is None and not servo and set(source.u.units[:inputs]) <= _OF_MOTORS
-    if motors:
-        options = ["experiment=oscillators"]
     return LogCheck(
         source=source,
         measurements=measurements,
         runs=pd.DataFrame([_run(part) for part in source.cleaned]),
         coordinates=coordinates,
-        inputs=_inputs_table(source, training, delays),
-        delays=delays,
-        steps=_filter(source, training, step, coordinates, highest) if filtered else [],
-        delay=_delay(source, clear),
-        options=[] if fast else options,
-        model="oscillators" if motors else "lnn",
+        inputs=_inputs_table(source, training, answers.curves),
+        delays=answers.curves,
+        steps=steps,
+        delay=_delay(source, answers.clear),
+        candidates=_candidates(source, structure, servo=servo, dry=dry, fast=bool(fast)),
+        driven=answers.driven,
         rigid=excitation,
-        motion=motion,
-        equations=equations,
+        motion=answers.motion,
     )
+
+
+def _answers(
+    source: logs.LogSource,
+    training: Sequence[logs.Recording],
+    others: Sequence[logs.Recording],
+    step: float,
+    longest: float,
+    structure: Structure | None,
+    servo: bool,
+) -> _Answers:
+    """Ask the equation of motion."""
+    inputs, size = len(source.u.columns), len(source.q.columns)
+    rigid = _regressor(structure, inputs)
+    first = parts_of(training, step)
+    everything = [*first, *parts_of(others, step)]
+    names = list(dict.fromkeys(item.run for item in everything))
+    if inputs > size:
+        everything = [with_products(item) for item in everything]
+    widths = averages_of_widths(everything, step)
+    of_training = [data.rows(data.stretch < len(first)) for data in widths]
+    curves = input_delays(first, longest=longest, rigid=rigid, widths=of_training)
+    results: list[Measurement] = []
+    if not widths:
+        return _Answers(results, curves, [0.0] * inputs, [1] * inputs)
+    chosen = compared(widths)
+    faults, curves, held = input_faults([of_training[k] for k in chosen], curves, source.u, rigid)
+    # The lag of a servo is no delay.
+    clear = [0.0] * inputs if servo else clear_delays(curves, step)
+    late = [widths[k].delayed(clear) for k in chosen]
+    data = [x.rows(x.stretch < len(first)) for x in late]
+    of_robot = [] if structure is None else compare_structure(structure, data, source.u)
+    wrong = {x.place for x in of_robot if x.name == FIT and x.verdict != "ok"}
+    if wrong and structure is not None:
+        # A wrong robot has wrong delays.
+        pairs = zip(curves, structure.joint_names, strict=True)
+        curves = [x.without(_WRONG) if j in wrong and x.of_bodies else x for x, j in pairs]
+        clear = [0.0] * inputs if servo else clear_delays(curves, step)
+        late = [widths[k].delayed(clear) for k in chosen]
+    width = max(data.width for data in late)
+    motions = [equations_of_motion(data, source.q, source.u, width, rigid) for data in late]
+    # A fault of an input or of the clock explains runs that differ, and signs.
+    of_clock = [x for x in source.measurements if x.name == LOST]
+    if all(x.verdict == "ok" for x in [*faults, *of_clock]):
+        results += check_runs(motions, names, inverse=inputs <= size, exact=not wrong)
+        if not any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok"):
+            results += check_signs(motions[0], source.u, curves, rigid)
+    results += faults
+    free = [False] * size if structure is None else _free(structure)
+    results += check_angles(late[0], source.q, free)
+    if source.v is not None:
+        results += check_velocity_lag(everything, source.q, source.v, step, late[0].width)
+    results += _inputs_measured(source, data[0], curves, clear)
+    results += of_robot
+    driven = [driven_joint(data[0], i) for i in range(inputs)] if 0 < inputs < size else []
+    return _Answers(results, curves, clear, held, motions[0], driven)
+
+
+def _regressor(structure: Structure | None, inputs: int) -> Regressor | None:
+    """Return the regressor of a robot with an input per joint."""
+    square = structure is not None and structure.num_coordinates == inputs
+    return regressor(structure) if structure is not None and square else None
+
+
+def _free(structure: Structure) -> list[bool]:
+    """Return true for coordinates whose joints turn without end."""
+    limits = getattr(structure, "limits", None)
+    if limits is None:
+        return [False] * structure.num_coordinates
+    return [abs(high - low - 2 * np.pi) < 1e-6 for low, high in limits[:, :2].tolist()]
+
+
+def _held(rows: int, step: float) -> Measurement:
+    text = (
+        f"q is held at {1 / (rows * step):.3g} Hz: all columns repeat for {rows} rows; add the "
+        "steps below to the data set, and check it again: the equation of motion is not yet checked"
+    )
+    return _judged("rows between two values of q", "q", rows, "1", True, text)
+
+
+def _lines(source: logs.LogSource, held: Sequence[int], rows: int, step: float) -> list[str]:
+    """Return steps that draw lines between the values of held signals, and thin out held rows."""
+    longest = max(held, default=1)
+    if max(longest, rows) == 1:
+        return []
+    signals = ["u"]
+    if rows > 1:
+        of_u = max((held_rows(x.raw.u) for x in source.cleaned), default=1)
+        signals = ["q"] + ["v"] * (source.v is not None) + ["u"] * (of_u > 1)
+        longest = max(rows, of_u)
+    step_text = wording.step("InterpolateHeld", longest=2 * longest, signals=signals)
+    lines = [wording.line(_key(source, "interpolate"), step_text)]
+    if rows > 1:
+        rate, gap = round_rate(rows * step), float(f"{10 * rows * step:.3g}")
+        resample = wording.step("Resample", rate=rate, max_gap=gap)
+        lines.append(wording.line(_key(source, "resample_held"), resample))
+    return lines
+
+
+def _candidates(
+    source: logs.LogSource, structure: Structure | None, *, servo: bool, dry: bool, fast: bool
+) -> list[tuple[str, list[str]]]:
+    """Return models of a training, each with a reason, and their options."""
+    friction = ["model/friction=coulomb"] * dry
+    if servo:
+        options = ["model/input=servo", "model/integrator=rosenbrock", *friction]
+        return [("the inputs are targets of servos", ["model=lnn", *options])]
+    units = set(source.u.units)
+    if fast:
+        reason = "angles turn too far between two samples for an equation of motion"
+        return [(reason, ["model=mlp"])]
+    if structure is None and units and units <= _OF_MOTORS:
+        reason = (
+            "the inputs are positions or pressures of motors, no forces: a soft robot has more "
+            "modes than coordinates"
+        )
+        return [(reason, ["experiment=oscillators"])]
+    forces = [("the inputs are forces", ["model=lnn", *friction])]
+    if structure is not None or units <= _FORCES:
+        return forces
+    return [
+        ("if the inputs are forces or torques", ["model=lnn", *friction]),
+        ("if they are positions or pressures of motors", ["experiment=oscillators"]),
+        ("if neither holds: a black box", ["model=mlp"]),
+    ]
 
 
 def _follows_targets(
@@ -124,15 +293,18 @@ def _follows_targets(
 
 def _inputs_measured(
     source: logs.LogSource,
-    training: list[logs.Recording],
-    delays: Sequence[logs.DelayCurve],
+    data: Averages,
+    delays: Sequence[DelayCurve],
     clear: Sequence[float],
-    step: float,
 ) -> list[Measurement]:
     """Measure the share of the motion that the inputs explain, and their delays."""
     if not delays:
         return []
-    share = numbers.explained_share(training, delays, step)
+    acting = [curve.delay or 0.0 for curve in delays]
+    data = replace(data, u=data.u[:, : len(delays)])
+    share = numbers.explained_share(
+        data.delayed([a - c for a, c in zip(acting, clear, strict=True)])
+    )
     text = (
         f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
         "inputs of this robot, on the same clock?"
@@ -175,7 +347,7 @@ def _condition(excitation: RigidExcitation) -> Measurement:
 
 
 def _inputs_table(
-    source: logs.LogSource, training: list[logs.Recording], delays: Sequence[logs.DelayCurve]
+    source: logs.LogSource, training: list[logs.Recording], delays: Sequence[DelayCurve]
 ) -> pd.DataFrame:
     u = np.vstack([item.u for item in training])
     table = {
@@ -213,6 +385,8 @@ def _coordinates(
     noise = np.median([white_noise(x) for x in raw], axis=0)
     tested = np.vstack([item.q.numpy() for item in test])
     low, high = q.min(axis=0), q.max(axis=0)
+    outside = (tested < low) | (tested > high)
+    all_poses = (np.array(source.q.units) == "rad") & (high - low > 2 * np.pi)
     table = {
         "coordinate": source.labels,
         "min": low,
@@ -220,7 +394,7 @@ def _coordinates(
         "fastest [/s]": np.abs(v).max(axis=0),
         "noise of q": noise,
         "noise / range": noise / (high - low).clip(min=1e-300),
-        "test outside": ((tested < low) | (tested > high)).mean(axis=0),
+        "test outside": np.where(all_poses, 0.0, outside.mean(axis=0)),
     }
     return pd.DataFrame(table)
 

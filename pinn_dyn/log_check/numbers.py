@@ -1,49 +1,52 @@
-"""Numbers of a log check: noise, share of the inputs, bandwidth."""
+"""Numbers of a log check: share of the inputs, targets, units of angles, and lag of v."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from pinn_dyn.data.logs import DelayCurve, Recording
-from pinn_dyn.data.logs.check.averages import Averages
-from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression
-from pinn_dyn.data.logs.check.input_faults import delayed
+from pinn_dyn.data.logs import Columns, Measurement, Recording
+from pinn_dyn.data.logs.measurement import judged
+from pinn_dyn.log_check.averages import Averages
+from pinn_dyn.log_check.equation import EquationOfMotionRegression, terms
 
 _LAGS = 30  # of a target that are tried
 _STILL = 0.01  # variance of a coordinate at rest as a share of the largest
-_INDEPENDENT = 3.5  # widths at which the averages of two rows are independent
+_PERIODIC = 0.6  # of the acceleration: largest share that periodic terms leave
+_FREE = 0.03  # largest share of the acceleration of a free motor that its input leaves
+_BETTER = 0.5  # residual with one unit of an angle over that with the other
+_EXACT = 1e-6  # residual that is one of rounding
+_LONGEST, _LAGGED = 0.2, 0.5  # lag of v, s; share over that without a lag
+_CLEAR = 0.8  # correlation of v and dq/dt
 
 
-def explained_share(
-    training: Sequence[Recording], delays: Sequence[DelayCurve], step: float
-) -> float:
-    """Return the largest share of v and a that delayed inputs explain beside (1, q, v).
+def unexplained(data: Averages, y: np.ndarray, *x: np.ndarray) -> float:
+    """Return the mean share of the variance of y that (1, x) leaves, per degree of freedom."""
+    one = np.ones((len(data), 1))
+    columns = {"x": np.hstack([one, *x]), "y": y - y.mean(axis=0)}
+    regression = EquationOfMotionRegression(columns, np.zeros(len(data), dtype=int))
+    freedom = max(len(data) - columns["x"].shape[1], 1)
+    return float(regression.fit("y", ["x"]).shares()[0].mean()) * len(data) / freedom
 
-    The result is 1 where the rows are too few to tell.
+
+def explained_share(data: Averages) -> float:
+    """Return the largest share of v and a that the inputs explain beside (1, q, v).
+
+    The result is 1 where the independent rows are too few to tell.
     """
-    parts = delayed(training, [curve.delay or 0.0 for curve in delays])
-    data = Averages.of(parts, step, spacing=_INDEPENDENT)
-    if data is None or len(data.t) < 6 * (3 * data.q.shape[1] + len(delays)):
+    data = data.independent()
+    q, v, u = data.q, data.v - data.v.mean(axis=0), data.u - data.u.mean(axis=0)
+    if len(data) < 6 * (3 * q.shape[1] + u.shape[1]):
         return 1.0
-    u = data.u[:, 0]
-    columns = {"one": np.ones((len(u), 1)), "u": u - u.mean(axis=0), "q": data.q}
-    columns |= {"sin": np.sin(data.q), "cos": np.cos(data.q)}
-    columns |= {"v": data.v - data.v.mean(axis=0), "a": data.a - data.a.mean(axis=0)}
-    regression = EquationOfMotionRegression(columns, np.zeros(len(u), dtype=int))
-
-    def unexplained(y: str, *x: str) -> float:
-        """Return the share of the variance of y that x leaves, per degree of freedom."""
-        names = ["one", "q", "sin", "cos", *x]
-        count = sum(columns[name].shape[1] for name in names)
-        return float(regression.fit(y, names).shares()[0].mean()) * len(u) / (len(u) - count)
-
+    known = q, np.sin(q), np.cos(q)
     return max(
-        unexplained("v") - unexplained("v", "u"),
-        unexplained("a", "v") - unexplained("a", "v", "u"),
+        unexplained(data, v, *known) - unexplained(data, v, *known, u),
+        unexplained(data, data.a, *known, v) - unexplained(data, data.a, *known, v, u),
         # The acceleration of a controlled robot may follow from q and v; its torque then does too.
-        1 - unexplained("u", "v", "a"),
+        1 - unexplained(data, u, *known, v, data.a),
     )
 
 
@@ -64,3 +67,80 @@ def target_distance(training: Sequence[Recording], step: float, longest: float) 
         parts = [item.q[lag:] - item.u[: len(item) - lag, :size] for item in training]
         shares.append(np.vstack(parts).var(axis=0) / spread)
     return float(np.min(shares, axis=0).max())
+
+
+def check_angles(data: Averages, q: Columns, free: Sequence[bool]) -> list[Measurement]:
+    """Measure the largest angles; an angle beyond 4 pi rad is probably in degrees.
+
+    Args:
+        data: averages of the log.
+        q: columns of the coordinates.
+        free: coordinates whose joint may turn without end by its description.
+    """
+    results = []
+    for k in (k for k, unit in enumerate(q.units) if unit == "rad"):
+        recordings = data.recordings
+        angle, run = max((float(np.abs(item.q[:, k]).max()), item.run) for item in recordings)
+        text = (
+            f"{run}, column {q.columns[k]!r}: an angle of {angle:.4g} rad is more than two turns: "
+            f"is it in degrees? Its unit is configured as {q.unit[k]!r}"
+        )
+        bad = angle > 4 * math.pi and not free[k] and not _turns(data, k)
+        results.append(judged("largest angle [rad]", q.columns[k], angle, "below 4 pi", bad, text))
+    return results
+
+
+def _turns(data: Averages, k: int) -> bool:
+    """Tell whether angle k grows up to the end, or its joint has the period of a turn.
+
+    A free motor, whose acceleration follows from its input and its friction, may turn, too.
+    """
+    steps = [np.diff(item.q[:: max(1, len(item) // 50), k]) for item in data.recordings]
+    path, last = sum(np.abs(x).sum() for x in steps), sum(abs(x[-1]) * len(x) for x in steps)
+    if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
+        return True
+    a, inputs = data.a[:, [k]], data.u
+    plain = min(unexplained(data, a, data.v), unexplained(data, a, data.v, data.q))
+    periodic = unexplained(data, a, data.v, np.sin(data.q), np.cos(data.q))
+    if (
+        periodic < _PERIODIC * plain
+        or unexplained(data, a, data.v, inputs, np.sign(data.v)) < _FREE
+    ):
+        return True
+    degrees = np.where(np.arange(data.q.shape[1]) == k, math.pi / 180, 1.0)
+    converted = replace(data, q=data.q * degrees)
+    y = data.u if inputs.shape[1] else a
+    form = "inverse dynamics" if inputs.shape[1] else "acceleration"
+    in_radians, in_degrees = (unexplained(data, y, terms(x, form)) for x in (data, converted))
+    return in_radians < _BETTER * in_degrees and in_degrees > _EXACT
+
+
+def check_velocity_lag(
+    recordings: Sequence[Recording], q: Columns, v: Columns, step: float, width: float
+) -> list[Measurement]:
+    """Measure the lag of v behind dq/dt, as that of a filter or of another clock."""
+    parts = [replace(item, u=item.v) for item in recordings if item.v is not None]
+    last = max(2, min(round(_LONGEST / step), min(map(len, parts)) // 4))
+    lags = np.unique(np.linspace(-last, last, 2 * min(last, 20) + 1).round().astype(int))
+    data = Averages.of(parts, step, width)
+    if data is None:
+        return []
+    data = data.rows((data.since >= last * step) & (data.left >= last * step))
+    results = []
+    for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
+        measured = data.input_at(k, data.t[:, None] - lags * step)
+        columns = {"v": measured, "slope": data.v[:, k], "one": np.ones(len(data))}
+        regression = EquationOfMotionRegression(columns, np.zeros(len(data), dtype=int))
+        shares = regression.fit("v", ["slope", "one"]).shares()[0]
+        best = int(shares.argmin())
+        # Lag l of a column means that it is read l samples earlier: a late v needs a negative one.
+        lag = -lags[best] * step
+        clear = shares[best] < min(_LAGGED * shares[lags == 0][0], 1 - _CLEAR**2)
+        bad = bool(clear and abs(lag) > 1.5 * step)
+        text = (
+            f"column {b!r} is {1e3 * abs(lag):.3g} ms {'behind' if lag > 0 else 'ahead of'} the "
+            f"derivative of {a!r}: is it filtered or from another clock? Leave out v (it is then "
+            "computed from q), or correct its times"
+        )
+        results.append(judged("lag of v [ms]", f"{a}, {b}", 1e3 * lag, "0", bad, text))
+    return results

@@ -7,14 +7,12 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
 from pinn_dyn import wording
 from pinn_dyn.data import logs
-from pinn_dyn.data.logs.check.averages import PARTS, Averages
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.report.page import (
@@ -28,11 +26,10 @@ from pinn_dyn.evaluation.report.page import (
     table,
 )
 from pinn_dyn.identification.rigid_excitation import RigidExcitation
-from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels
+from pinn_dyn.log_check.delay import DelayCurve
+from pinn_dyn.log_check.figures import delay_curves, forces, residuals
+from pinn_dyn.log_check.runs import Motion
 from pinn_dyn.whole import write_whole
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _ROWS = 50  # of a table in the terminal
 _HEADS = {  # of options, in Python
@@ -41,10 +38,15 @@ _HEADS = {  # of options, in Python
     "model/friction=coulomb": "friction=pinn_dyn.models.CoulombFriction",
 }
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
-_DRAWN = 1000  # rows of the equation of motion
 _FORCES = (
     "The equation of motion is fitted to all runs. The residual is the part of an input that the "
     "motion does not explain: friction that depends on the load, contacts, or a fault of the log."
+)
+_RESIDUALS, _DELAYS = "residuals", "delays"  # names of places in the page
+_OF_STATES = (
+    "The residual of each force over position and speed of its joint, in all runs: of rigid bodies "
+    "with a URDF, else of a generic equation. A curve over q is a spring, a hose or a wrong "
+    "kinematics. The residual over v includes the dry friction, whose curve is visible there."
 )
 _INPUTS = (
     "The curve shows the share of the equation of motion that stays unexplained if an input is "
@@ -64,13 +66,10 @@ class LogCheck:
         delays: delay curve of each input.
         steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
         delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
-        options: options of a training: heads for dry friction or servos, or the settings of
-            oscillators, if needed; none if an angle turns too far in a sample for a step.
-        model: model of a training: oscillators for inputs that are positions or pressures of
-            motors, which the coordinates do not follow, of a robot without a structure; else lnn.
+        candidates: models of a training, each with the reason and its options.
+        driven: number of the joint that each input drives, of fewer inputs than coordinates.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
-        motion: averages of the motion, or None if it is too short for an equation of motion.
-        equations: equations of motion of the log.
+        motion: averages and equations of motion; None if there are too few rows for an equation.
     """
 
     source: logs.LogSource
@@ -78,14 +77,13 @@ class LogCheck:
     runs: pd.DataFrame
     coordinates: pd.DataFrame
     inputs: pd.DataFrame
-    delays: list[logs.DelayCurve]
+    delays: list[DelayCurve]
     steps: list[str]
     delay: float | list[float] | None
-    options: list[str]
-    model: str = "lnn"
+    candidates: list[tuple[str, list[str]]]
+    driven: Sequence[int] = ()
     rigid: RigidExcitation | None = None
-    motion: Averages | None = None
-    equations: Sequence[logs.Equation] = ()
+    motion: Motion | None = None
 
     @property
     def problems(self) -> list[str]:
@@ -93,20 +91,9 @@ class LogCheck:
         return [x.text for x in self.measurements if x.verdict == "stop"]
 
     @property
-    def advice(self) -> str:
-        """Model and options of a training."""
-        options = shlex.join(self.options)
-        if self.model == "lnn":
-            options = f"model=lnn {options}"
-        if not wording.IN_YAML.get():
-            heads = "".join(f", {_HEADS.get(option)}" for option in self.options)
-            options = f"model=functools.partial(pinn_dyn.models.LagrangianNetwork{heads})"
-        if self.model == "lnn":
-            return f"Options of a training: {options}"
-        return (
-            "The inputs are positions or pressures of motors, no forces: a soft robot has more "
-            f"modes than coordinates. Options of a training: {wording.setting('model', self.model)}"
-        )
+    def advice(self) -> list[str]:
+        """Models of a training with their reasons and options, one in a line."""
+        return [f"A training, as {why}: {_options(x)}" for why, x in self.candidates]
 
     @property
     def warnings(self) -> list[str]:
@@ -168,8 +155,8 @@ class LogCheck:
         lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
         if self.block:
             lines += ["", "Append to the data set:", "", self.block]
-        if self.options and self.rigid is None:
-            lines += ["", self.advice]
+        if self.rigid is None and not self.problems:
+            lines += ["", *self.advice]
         return "\n".join(lines)
 
     def save(self, folder: str | Path, command: str = "") -> Path:
@@ -182,6 +169,30 @@ class LogCheck:
         return folder / "check.html"
 
 
+def _linked(text: str) -> Markup:
+    """Return a finding as a link to the figure that shows it."""
+    figure = _DELAYS if "after it is logged" in text else _RESIDUALS
+    shown = any(word in text for word in ("residual", "unexplained", "after it is logged"))
+    if not shown:
+        return paragraph(text)
+    return Markup('<p><a href="#{}">{}</a></p>').format(figure, text)
+
+
+def _anchored(name: str, *content: Markup) -> Markup:
+    return Markup('<div id="{}">{}</div>').format(name, Markup("").join(content))
+
+
+def _options(options: Sequence[str]) -> str:
+    """Return the options of a training, on the command line or in Python."""
+    if wording.IN_YAML.get():
+        return shlex.join(options)
+    name = options[0].partition("=")[2]
+    if name != "lnn":
+        return wording.setting("model", name)
+    heads = "".join(f", {_HEADS[option]}" for option in options[1:])
+    return f"model=functools.partial(pinn_dyn.models.LagrangianNetwork{heads})"
+
+
 def _cause(text: str) -> str:
     """Return the part of a text that names a cause, without names and numbers of its place."""
     return re.sub(r"[\d.]+|\S*[/\\']\S*", "", text.rpartition(": ")[2])
@@ -191,20 +202,28 @@ def check_report(check: LogCheck, *, command: str) -> str:
     """Return the HTML page of a check: verdict, forces, what is not ok, and the rest folded."""
     source = check.source
     verdict = [paragraph(f"{check.verdict[0].upper()}{check.verdict[1:]}.")]
-    if check.equations and check.motion is not None:
+    if check.motion is not None:
         text = "measured forces, the part that the equation of motion explains, and the residual"
-        verdict += [paragraph(_FORCES), drawing(_forces(check), text)]
-    verdict += [paragraph(text) for text in check.findings()]
+        verdict += [paragraph(_FORCES), drawing(forces(check.motion), text)]
+    verdict += [_linked(text) for text in check.findings()]
     if check.block:
         text = "Entries that follow from the measured delay and noise, to append to the data set:"
         verdict += [paragraph(text), preformatted(check.block)]
-    if check.options and check.rigid is None:
-        verdict.append(paragraph(check.advice))
+    if check.rigid is None and not check.problems:
+        verdict += [paragraph(text) for text in check.advice]
     cleaning = cleaning_figure(
         source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
     )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
-    parts = [
+    parts = []
+    if check.motion is not None and (figure := residuals(check.motion, source.q, source.v)):
+        drawn = drawing(figure, "residual of each force over position and speed of its joint")
+        parts.append(_anchored(_RESIDUALS, paragraph(_OF_STATES), drawn))
+    if check.delays:
+        curves = drawing(delay_curves(check.delays, check.inputs["input"]), "residual over delay")
+        inputs = [paragraph(_INPUTS), table(check.inputs), curves]
+        parts.append(_anchored(_DELAYS, *inputs))
+    parts += [
         details("All measurements", table(measurements)),
         details("Clock of each run", table(check.runs)),
         details("Coordinates", table(check.coordinates)),
@@ -216,49 +235,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
             f"Not determined: {check.rigid.undetermined}."
         )
         parts.append(details("Rigid bodies", paragraph(text), table(check.rigid.joints)))
-    if check.delays:
-        curves = drawing(_delays(check), "unexplained share over the delay")
-        inputs = [paragraph(_INPUTS), table(check.inputs), curves]
-        parts.append(details("Inputs and their delays", *inputs))
     drawn = drawing(cleaning, "raw and cleaned signals")
     parts.append(details("Cleaning", drawn, from_markdown(source.report)))
     sections = [Section("Verdict", verdict), Section("Measurements", parts)]
     return page(f"{source.name}: check of the log", command, sections)
-
-
-def _forces(check: LogCheck) -> Figure:
-    """Draw y, X theta and the residual of each equation of motion in the longest run."""
-    assert check.motion is not None
-    runs, counts = np.unique(check.motion.block // PARTS, return_counts=True)
-    rows = np.flatnonzero(check.motion.block // PARTS == runs[counts.argmax()])[:_DRAWN]
-    t = check.motion.t[rows]
-    breaks = np.flatnonzero(np.diff(t) > 10 * np.median(np.diff(t))) + 1  # between stretches
-    pairs = [equation.predicted() for equation in check.equations]
-    measured, explained = (np.hstack(x)[rows] for x in zip(*pairs, strict=True))
-    labels = [label for equation in check.equations for label in equation.labels]
-    figure, (axes,) = panels([labels], t, title="Forces and the equation of motion, means removed")
-    curves = {
-        "measured": (measured, TRUTH),
-        "explained": (explained, COLORS[0]),
-        "residual": (measured - explained, COLORS[1]),
-    }
-    for name, (values, color) in curves.items():
-        gaps = np.insert(values, breaks, np.nan, axis=0)
-        for ax, column in zip(axes, gaps.T, strict=True):
-            ax.plot(np.insert(t, breaks, np.nan), column, color=color, linewidth=1.0, label=name)
-    legend_below(figure)
-    return figure
-
-
-def _delays(check: LogCheck) -> Figure:
-    from matplotlib.figure import Figure  # takes a quarter of a second
-
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    ax = figure.subplots()
-    for k, (name, curve) in enumerate(zip(check.inputs["input"], check.delays, strict=True)):
-        ax.plot(1e3 * curve.candidates, 100 * curve.residual, color=f"C{k}", label=name)
-        if curve.delay is not None:
-            ax.axvline(1e3 * curve.delay, color=f"C{k}", linewidth=0.8, linestyle="--")
-    ax.set(xlabel="delay (ms)", ylabel="unexplained (%)", yscale="log")
-    ax.legend(fontsize="small")
-    return figure

@@ -2,99 +2,170 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from pinn_dyn import wording
-from pinn_dyn.data.logs import Columns, DelayCurve, Recording, clear_delays
-from pinn_dyn.data.logs.check.averages import Averages
-from pinn_dyn.data.logs.check.delay import force_columns
-from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression, Regressor
-from pinn_dyn.data.logs.check.input_faults import delayed
-from pinn_dyn.data.logs.measurement import Measurement, judged
+from pinn_dyn.data.logs import Columns, Measurement
+from pinn_dyn.data.logs.measurement import judged
+from pinn_dyn.log_check.averages import Averages
+from pinn_dyn.log_check.delay import FEWEST
+from pinn_dyn.log_check.equation import (
+    EquationOfMotionRegression,
+    Regressor,
+    force_columns,
+    tenths,
+)
+from pinn_dyn.log_check.numbers import unexplained
 from pinn_dyn.models.structure import Structure
 from pinn_dyn.systems import RigidChain
 
 SECTION = "docs/known_mechanics.md#does-the-urdf-fit-the-log"
+FIT = "residual of the URDF over that of a generic equation"
+"""Name of the measurement of the fit of a URDF."""
 SCALE = "torque over that of the URDF's bodies"
 """Name of the measurement of the scale of an input; NaN where it is not clear."""
-_UNEXPLAINED = 0.05  # share of the variance of a torque from which a URDF may be wrong
-_WORSE = 4.0  # unexplained share over that of a generic equation
+_WORSE = 4.0  # mean square over that of a generic equation
+_TENTHS = 8  # of the data in which the URDF leaves more
 _EXPLAINS = 0.3  # unexplained share with a cause over that without, at most
 _TIE = 1.1  # unexplained share over that of the best cause, up to which both are named
-_ROWS = 1500  # that the causes are tried on
-_ANGLES = np.linspace(-np.pi, np.pi, 24, endpoint=False)  # rad, of homing offsets
+_UNKNOWN = (
+    "no reversed, exchanged or coupled joint, offset, gear, direction of gravity or spring "
+    "explains it; check the kinematics (lengths, axes, order of the joints) and the columns"
+)
+_ROWS = 1500  # of the comparison
+_FEW, _BEST = 300, 5  # rows that causes are tried on; causes that are judged on held-out data
+_TRIED = 3  # inputs with the largest residuals that causes have to explain
+_WHITE = 0.8  # residual with a wide kernel over that with a narrow one, of noise
+_ANGLES = np.linspace(-np.pi, np.pi, 12, endpoint=False)  # rad, of homing offsets
 _FACTORS = np.array([2.0, 3.0, 4.0, 5.0, 6.0, 10.0])  # of gears, and their inverses
+_CHUNK = 500  # rows of a call of a regressor, for its memory
 _SCALE = 2.5  # of torques over those of the URDF's bodies
 _CERTAIN = 0.1  # largest standard error of a scale, as a share of it
 
 
 @dataclass(frozen=True)
 class _Cause:
-    """A change of a log or of a URDF that may explain the torques."""
+    """A change of a log or of a URDF that may explain the torques.
+
+    Attributes:
+        text: cause and cure.
+        data: averages of the changed log.
+        bodies: regressor of the rigid bodies at the rows, ``(R, N, P)``.
+        extra: input and a column that explains it, too; None without.
+    """
 
     text: str
     data: Averages
-    rigid: Regressor | None
-    spring: int | None = None
+    bodies: np.ndarray
+    extra: tuple[int, np.ndarray] | None = None
 
 
 def regressor(structure: Structure) -> Regressor:
     """Return the regressor of a structure on NumPy arrays."""
 
     def function(*motion: np.ndarray) -> np.ndarray:
-        return structure.regressor(*map(torch.from_numpy, motion)).numpy()
+        parts = zip(*(np.array_split(x, len(x) // _CHUNK + 1) for x in motion), strict=True)
+        bodies = [structure.regressor(*map(torch.from_numpy, part)).numpy() for part in parts]
+        return np.concatenate(bodies)
 
     return function
 
 
+def held_out(
+    data: Averages, i: int, bodies: np.ndarray | None, extra: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """Return the mean squares of input i that fits to nine tenths leave of the last, ``(B,)``.
+
+    The second result is the mean square of the input. ``extra`` are more columns, ``(R, .)``.
+    """
+    rows = data.moving[:, i]
+    columns = force_columns(data.rows(rows), i, None if bodies is None else bodies[rows])
+    if extra is not None:
+        columns["extra"] = extra[rows]
+    y = data.u[rows, i] - data.u[rows, i].mean()
+    regression = EquationOfMotionRegression({**columns, "y": y}, tenths(data.rows(rows)))
+    left = regression.held_out("y", list(columns))[:, 0] / np.bincount(regression.block)
+    return left, float((y**2).mean())
+
+
 def compare_structure(
-    structure: Structure,
-    recordings: Sequence[Recording],
-    curves: Sequence[DelayCurve],
-    u: Columns,
-    step: float,
+    structure: Structure, widths: Sequence[Averages], u: Columns
 ) -> list[Measurement]:
     """Compare what rigid bodies and a generic equation leave of each torque, and name the cause.
 
-    The causes that are tried are reversed joints, exchanged joints or inputs, offsets and factors
-    of q, other directions of gravity, and springs. If the URDF fits, the scale s_i of the torques
-    is compared with that of its bodies::
+    Both are fitted to nine tenths of the data and judged on the last tenth. The URDF does not fit a
+    joint if it leaves four times as much as the generic equation, in most tenths, with kernels of
+    two widths. The causes that are tried are reversed joints, exchanged or coupled joints or
+    inputs, offsets and factors of q, other directions of gravity, and springs. At the other joints
+    the scale s_i of the torques is compared with that of the URDF's bodies::
 
         u_i = s_i Y_i(q, v, a) pi_0 + r a_i + d v_i + c sign(v_i) - o
 
     Args:
         structure: rigid robot with one input per joint; others are not compared.
-        recordings: training stretches.
-        curves: delays of the inputs.
+        widths: averages of the training with kernels of two widths, and inputs as they act.
         u: columns of the inputs.
-        step: sample time, s.
     """
-    size = structure.num_coordinates
-    parts = delayed(recordings, clear_delays(curves, step))
-    data = Averages.of(parts, step, spacing=0.5)
-    if data is None or not isinstance(structure, RigidChain) or len(u.columns) != size:
-        return []
-    data = data.rows(np.arange(len(data.t)) % max(1, len(data.t) // _ROWS) == 0)
-    if len(data.t) < 4 * data.q.shape[1] * 14:
+    if not isinstance(structure, RigidChain) or len(u.columns) != structure.num_coordinates:
         return []
     rigid = regressor(structure)
-    plain = _Cause("", data, rigid)
-    left, generic = _left(plain), _left(replace(plain, rigid=None))
-    bad = (left > _UNEXPLAINED) & (left > _WORSE * generic)
-    hint = _explanation(structure, plain, left) if bad.any() else ""
+    thinned = [data.thinned(_ROWS) for data in widths]
+    trials = [(data, rigid(data.q, data.v, data.a)) for data in thinned]
+    rows = [i for i in range(len(u.columns)) if thinned[0].moving[:, i].sum() >= FEWEST]
+    fits = {i: [_fit(data, bodies, i) for data, bodies in trials] for i in rows}
+    suspects = [
+        i
+        for i, (narrow, wide) in fits.items()
+        if wide.left > _WHITE * narrow.left or (narrow.suspect and wide.suspect)
+    ]
+    bad = {i for i, pair in fits.items() if all(fit.worse and fit.suspect for fit in pair)}
+    worst = sorted(suspects, key=lambda i: -fits[i][0].left)[:_TRIED]
+    hint = _explanation(structure, thinned[0], worst) if worst else ""
+    if hint:
+        bad = set(suspects)
     results = []
-    for i, joint in enumerate(structure.joint_names):
+    for i, pair in fits.items():
+        joint = structure.joint_names[i]
         text = (
-            f"the URDF leaves {100 * left[i]:.2g} % of {u.columns[i]!r} at joint {joint} "
-            f"unexplained, a generic equation {100 * generic[i]:.2g} %: {hint}"
+            f"the URDF leaves {100 * pair[0].left:.2g} % of {u.columns[i]!r} at joint {joint} "
+            f"unexplained, a generic equation {100 * pair[0].generic:.2g} %: {hint or _UNKNOWN}"
         )
-        measured = ("share that the URDF does not explain", joint, left[i])
-        results.append(_judged(*measured, f"below {_UNEXPLAINED}", bool(bad[i]), text))
-    return results if bad.any() else [*results, *_scales(structure, data, u)]
+        ratio = pair[0].left / max(pair[0].generic, 1e-300)
+        results.append(_judged(FIT, joint, ratio, f"below {_WORSE:g}", i in bad, text))
+    return results + _scales(structure, thinned[0], u, bad)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Shares of an input that rigid bodies and a generic equation leave.
+
+    Attributes:
+        left: share of held-out data that the rigid bodies leave.
+        generic: share of the same data that a generic equation leaves, fitted to it.
+        suspect: the rigid bodies leave more than that: causes are tried.
+        worse: they leave more than a generic equation does of held-out data, in most tenths.
+    """
+
+    left: float
+    generic: float
+    suspect: bool
+    worse: bool
+
+
+def _fit(data: Averages, bodies: np.ndarray, i: int) -> _Fit:
+    """Compare the two equations of input i."""
+    left, total = held_out(data, i, bodies)
+    generic, _ = held_out(data, i, None)
+    worse = left.mean() > _WORSE * generic.mean() and (left > generic).sum() >= _TENTHS
+    rows = data.rows(data.moving[:, i])
+    columns = force_columns(rows, i, None)
+    least = unexplained(rows, rows.u[:, [i]], *columns.values())
+    share = float(left.mean() / total)
+    return _Fit(share, least, share > _WORSE * least, bool(worse))
 
 
 def _judged(
@@ -103,92 +174,133 @@ def _judged(
     return judged(name, place, value, expected, bad, text, section=SECTION)
 
 
-def _left(cause: _Cause) -> np.ndarray:
-    """Return the share of each input that the equation leaves, ``(N,)``."""
-    shares, motion = [], (cause.data.q, cause.data.v, cause.data.a)
-    # A call for all joints: the regressor takes most of the time of a check.
-    bodies = None if cause.rigid is None else cause.rigid(*motion)
-    for i in range(cause.data.q.shape[1]):
-        moving = cause.data.moving[:, i]
-        data = cause.data.rows(moving)
-        if len(data.t) < _ROWS // 10:
-            shares.append(0.0)
-            continue
-        rigid = None if bodies is None else lambda *_, of_rows=bodies[moving]: of_rows
-        columns = force_columns(data, i, rigid)
-        if cause.spring == i:
-            columns["spring"] = data.q[:, i]
-        y = data.u[:, 0, i] - data.u[:, 0, i].mean()
-        regression = EquationOfMotionRegression({**columns, "y": y}, np.zeros(len(y), dtype=int))
-        shares.append(float(regression.fit("y", list(columns)).shares()[0, 0]))
-    return np.array(shares)
+def _left(cause: _Cause, joints: Sequence[int]) -> float:
+    """Return the sum of the shares of inputs that rigid bodies leave, per degree of freedom."""
+    shares = []
+    for i in joints:
+        rows = cause.data.moving[:, i]
+        if rows.sum() < _FEW // 4:  # exchanged with a joint that rests
+            return np.inf
+        data = cause.data.rows(rows)
+        columns = force_columns(data, i, cause.bodies[rows])
+        if cause.extra is not None and cause.extra[0] == i:
+            columns["extra"] = cause.extra[1][rows].reshape(len(data), -1)
+        shares.append(unexplained(data, data.u[:, [i]], *columns.values()))
+    return float(np.sum(shares))
 
 
-def _explanation(structure: RigidChain, plain: _Cause, left: np.ndarray) -> str:
-    """Return the cause that leaves the least, in words."""
-    causes = list(_causes(structure, plain))
-    totals = np.array([_left(cause).sum() for cause in causes])
-    if totals.min() < _EXPLAINS * left.sum():
-        # In a plane, the mirror image of a reversed joint is the other joint reversed.
-        return "; or ".join(causes[k].text for k in np.flatnonzero(totals < _TIE * totals.min()))
-    return (
-        "no reversed or exchanged joint, offset, gear, direction of gravity or spring explains it; "
-        "check the kinematics (lengths, axes, order of the joints) and the columns"
-    )
+def _left_of_held_out(cause: _Cause, joints: Sequence[int]) -> float:
+    """Return the sum of the shares of inputs that rigid bodies leave of held-out data."""
+    shares = []
+    for i in joints:
+        extra = cause.extra[1] if cause.extra is not None and cause.extra[0] == i else None
+        left, total = held_out(cause.data, i, cause.bodies, extra)
+        shares.append(left.mean() / max(total, 1e-300))
+    return float(np.sum(shares))
 
 
-def _causes(structure: RigidChain, plain: _Cause) -> Iterator[_Cause]:
+def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -> str:
+    """Return the causes that leave least of the inputs, in words; "" if none leaves much less."""
+    data = data.thinned(_FEW)
+    plain = _Cause("", data, regressor(structure)(data.q, data.v, data.a))
+    causes = sorted(_causes(structure, plain, joints), key=lambda cause: _left(cause, joints))
+    causes = [cause for cause in causes[:_BEST] if np.isfinite(_left(cause, joints))]
+    totals = np.array([_left_of_held_out(cause, joints) for cause in causes])
+    if not totals.min(initial=np.inf) < _EXPLAINS * _left_of_held_out(plain, joints):
+        return ""
+    # In a plane, the mirror image of a reversed joint is the other joint reversed.
+    ties = np.flatnonzero(totals < max(_TIE * totals.min(), 1e-6))
+    return "; or ".join(dict.fromkeys(causes[k].text for k in ties))
+
+
+def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iterator[_Cause]:
     names, size = structure.joint_names, structure.num_coordinates
-    data = plain.data
+    data, rigid = plain.data, regressor(structure)
+
+    def changed(text: str, motion: Averages, rigid: Regressor = rigid) -> _Cause:
+        return _Cause(text, motion, rigid(motion.q, motion.v, motion.a))
+
     for k, name in enumerate(names):
         reversed_k = np.where(np.arange(size) == k, -1.0, 1.0)
-        power = float((data.u[:, 0, k] * data.v[:, k]).mean())
+        power = float((data.u[:, k] * data.v[:, k]).mean())
         columns = "q, v and u" if power > 0 else "q and v"
         text = f"joint {name} turns the other way in the log: reverse its axis, or {columns} of it"
-        yield replace(plain, text=text, data=_scaled(data, reversed_k))
+        yield changed(text, _scaled(data, reversed_k))
         springs = wording.setting("model.springs", [name])
         text = f"a spring at joint {name} explains it: fit it with {springs}"
-        yield replace(plain, text=text, spring=k)
-        yield from _offsets(plain, k, name)
-        for factor in (*_FACTORS, *(1 / _FACTORS)):
-            scale = np.where(np.arange(size) == k, 1 / factor, 1.0)
-            text = f"q and v of joint {name} are {factor:.3g} times those of the URDF, as by a gear"
-            yield replace(plain, text=text, data=_scaled(data, scale))
+        yield replace(plain, text=text, extra=(k, data.q[:, k]))
+        yield _affine(plain, rigid, k, name, joints)
     for i in range(size):
-        for j in range(i):
+        for j in range(size):
+            pair = f"{names[j]} and {names[i]}"
+            if i != j:
+                text = (
+                    f"the input of joint {names[i]} holds the torques of the joints {pair}, as of "
+                    "a belt or a differential: convert it to torques of the joints"
+                )
+                yield replace(plain, text=text, extra=(i, plain.bodies[:, j]))
+            if j >= i:
+                continue
             order = np.arange(size)
             order[[i, j]] = order[[j, i]]
-            pair = f"{names[j]} and {names[i]}"
             text = f"the inputs of the joints {pair} are exchanged"
-            yield replace(plain, text=text, data=replace(data, u=data.u[:, :, order]))
+            yield replace(plain, text=text, data=replace(data, u=data.u[:, order]))
             text = f"the columns of the joints {pair} are exchanged (q, v and u)"
-            yield replace(plain, text=text, data=_ordered(data, order))
+            yield changed(text, _ordered(data, order))
+    setting = wording.setting("model.structure.gravity", [0.0, 0.0, 0.0])
+    text = (
+        "gravity is missing in the log, as in torques before its compensation is added: log the "
+        f"torques that act, or set {setting}"
+    )
+    weightless = changed(text, data, regressor(structure.with_gravity([0.0, 0.0, 0.0])))
+    yield weightless
+    least = _left(weightless, joints)
     magnitude = float(np.linalg.norm(structure.gravity))
     for axis in range(3):
         for sign in (1.0, -1.0):
-            gravity = [sign * magnitude * (x == axis) for x in range(3)]
-            text = wording.setting("model.structure.gravity", gravity)
-            text = f"the base is mounted otherwise: set {text}"
-            yield replace(plain, text=text, rigid=regressor(structure.with_gravity(gravity)))
+            gravity = [sign * magnitude if x == axis else 0.0 for x in range(3)]
+            setting = wording.setting("model.structure.gravity", gravity)
+            text = f"the base is mounted otherwise: set {setting}"
+            cause = changed(text, data, regressor(structure.with_gravity(gravity)))
+            if _left(cause, joints) < least / _TIE:  # gravity along an axis has no torque
+                yield cause
 
 
-def _offsets(plain: _Cause, k: int, name: str) -> Iterator[_Cause]:
-    """Yield the best offset of coordinate k, found on a grid that is refined twice."""
+def _affine(plain: _Cause, rigid: Regressor, k: int, name: str, joints: Sequence[int]) -> _Cause:
+    """Return the best offset or factor of coordinate k, or both if neither explains it."""
+    data = plain.data
+    k_alone = np.arange(data.q.shape[1]) == k
 
-    def shifted(offset: float) -> _Cause:
-        q = plain.data.q + offset * (np.arange(plain.data.q.shape[1]) == k)
-        text = (
+    def changed(factor: float, offset: float) -> _Cause:
+        motion = _scaled(data, np.where(k_alone, 1 / factor, 1.0))
+        motion = replace(motion, q=motion.q + offset * k_alone)
+        return _Cause("", motion, rigid(motion.q, motion.v, motion.a))
+
+    def least(pairs: list[tuple[float, float]]) -> tuple[float, tuple[float, float]]:
+        trials = [(_left(changed(*pair), joints), pair) for pair in pairs]
+        return min(trials, key=lambda trial: trial[0])
+
+    factors = [*_FACTORS, *(1 / _FACTORS)]
+    results = [least([(1.0, x) for x in _ANGLES]), least([(x, 0.0) for x in factors])]
+    _, (factor, offset) = min(results)
+    width, ratio = _ANGLES[1] - _ANGLES[0], 1.4
+    for _ in range(4):
+        width, ratio = width / 3, ratio ** (1 / 3)
+        pairs = [(factor, offset + width * x) for x in (-1, 0, 1)]
+        if factor != 1.0:
+            pairs += [(factor * ratio, offset), (factor / ratio, offset)]
+        _, (factor, offset) = least(pairs)
+    parts = []
+    if factor != 1.0:
+        parts.append(
+            f"q and v of joint {name} are {factor:.3g} times those of the URDF, as by a gear"
+        )
+    if abs(offset) > width:
+        parts.append(
             f"{name} is {-offset:.3g} off: add {offset:.3g} to its column, or correct the origin "
             "of the joint"
         )
-        return replace(plain, text=text, data=replace(plain.data, q=q))
-
-    grid = _ANGLES
-    for _ in range(3):
-        best = min(grid, key=lambda x: float(_left(shifted(x)).sum()))
-        gap = (grid[1] - grid[0]) / 4
-        grid = best + gap * np.arange(-4, 5)
-    yield shifted(float(best))
+    return replace(changed(factor, offset), text=", and ".join(parts))
 
 
 def _scaled(data: Averages, scale: np.ndarray) -> Averages:
@@ -213,30 +325,31 @@ def _ordered(data: Averages, order: np.ndarray) -> Averages:
         sign=data.sign[:, order],
         slow_sign=data.slow_sign[:, np.concatenate([order, size + order])],
         moving=data.moving[:, order],
-        u=data.u[:, :, order],
+        u=data.u[:, order],
     )
 
 
-def _scales(structure: RigidChain, data: Averages, u: Columns) -> list[Measurement]:
+def _scales(
+    structure: RigidChain, data: Averages, u: Columns, bad: Collection[int]
+) -> list[Measurement]:
     """Compare the torques with those of the bodies of the URDF, where both are clear."""
     forces = set(u.units) <= {"Nm", "N"}
     if not (forces or set(u.units) <= {"A"}) or structure.tree.problems:
         return []
     q, v, a = map(torch.from_numpy, (data.q, data.v, data.a))
-    bodies = structure.rigid_force(q, v, a).numpy()
+    forces_of_bodies = structure.rigid_force(q, v, a).numpy()
     results = []
     for i, joint in enumerate(structure.joint_names):
         rows = data.moving[:, i]
-        if rows.sum() < _ROWS // 10:
+        if i in bad or rows.sum() < FEWEST:
             continue
         columns = {
-            "bodies": bodies[rows, i],
+            "bodies": forces_of_bodies[rows, i],
             "drive": np.column_stack([data.a[rows, i], data.v[rows, i], np.ones(rows.sum())]),
             "sign": data.sign[rows, i],
-            "y": data.u[rows, 0, i],
+            "y": data.u[rows, i],
         }
-        blocks = np.arange(rows.sum()) * 10 // rows.sum()
-        regression = EquationOfMotionRegression(columns, blocks)
+        regression = EquationOfMotionRegression(columns, tenths(data.rows(rows)))
         fit = regression.fit("y", ["bodies", "drive", "sign"], regression.jackknife())
         scale, parts = float(fit.theta[0, 0, 0]), fit.theta[1:, 0, 0]
         error = float(np.sqrt((len(parts) - 1) * parts.var()))

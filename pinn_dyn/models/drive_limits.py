@@ -10,7 +10,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import listed
-from pinn_dyn.models.known_constants import Constants, Named
+from pinn_dyn.models.known_constants import HasConstants
 from pinn_dyn.models.scales import Scales
 
 _SHARPNESS = 16  # the torque is 0.96 of its limit where the command reaches the limit
@@ -22,7 +22,7 @@ _SMALLEST = 1e-3  # smallest limit in units of that at rest, beyond the no-load 
 Limit = PositiveFloat | Sequence[PositiveFloat] | Literal["learned"] | None
 
 
-class DriveLimits(nn.Module):
+class DriveLimits(HasConstants):
     """Torque tau of a drive whose command asks for the torque s, as of a DC motor::
 
         l(w) = min(L, S (1 - w / w_0)),    -l(-v) <= tau <= l(v)
@@ -95,10 +95,6 @@ class DriveLimits(nn.Module):
     def at_rest(self) -> Tensor:
         """Return the largest torque at rest, min(L, S), ``(n,)``."""
         return torch.minimum(self._value("limit"), self._value("stall"))
-
-    def physical_constants(self) -> list[Named]:
-        """Return the learned limits."""
-        return [x.named() for x in self.learned.values() if isinstance(x, Constants)]
 
     def _value(self, name: str) -> Tensor:
         return self.learned[name]() if name in self.learned else self.get_buffer(f"fixed_{name}")

@@ -6,16 +6,16 @@ import abc
 
 import torch
 from pydantic import PositiveFloat
-from torch import Tensor, nn
+from torch import Tensor
 
-from pinn_dyn.models.known_constants import Named
+from pinn_dyn.models.known_constants import HasConstants, Named
 from pinn_dyn.models.scales import Scales
 
 _SMALLEST_WIDTH = 0.01
 """In units of the typical speed. A jump in the force could not be integrated."""
 
 
-class Friction(nn.Module, abc.ABC):
+class Friction(HasConstants, abc.ABC):
     """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0.
 
     With ``sticking``, rollouts use :meth:`sliding` instead of F. With ``by_load``, a part of the
@@ -43,10 +43,6 @@ class Friction(nn.Module, abc.ABC):
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
         """Return the joint force after transmission losses, ``(*batch, N)``. By default none."""
         return force
-
-    def physical_constants(self) -> list[Named]:
-        """Return the learned constants in physical units. The default has none."""
-        return []
 
 
 class NoFriction(Friction):

@@ -41,7 +41,7 @@ class JointSprings(nn.Module):
         self.preload = RealConstants(
             _PRELOAD * force[index],
             [f"rest {'angle' if joint.turns else 'position'} of {joint.name}" for joint in named],
-            ["rad" if joint.turns else "m" for joint in named],
+            [joint.force for joint in named],
         )
         self.register_buffer("selection", torch.eye(scales.size)[index], persistent=False)
 
@@ -60,4 +60,5 @@ class JointSprings(nn.Module):
     def physical_constants(self) -> list[Named]:
         """Return k and r."""
         rest = self.preload() / self.stiffness()
-        return [self.stiffness.named(), self.preload.named()._replace(values=rest)]
+        units = ["rad" if unit == "Nm" else "m" for unit in self.preload.units]
+        return [self.stiffness.named(), self.preload.named()._replace(values=rest, units=units)]

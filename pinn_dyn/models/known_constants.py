@@ -49,6 +49,22 @@ class Constants(nn.Module, abc.ABC):
         return Named(self.names, self.units, self().flatten(), self.lower)
 
 
+class HasConstants(nn.Module):
+    """Part of a model that lists the constants inside it."""
+
+    def physical_constants(self) -> list[Named]:
+        """Return all constants in physical units, and other parameters by their attributes."""
+        constants: list[Named] = []
+        for path, module in self.named_modules():
+            if isinstance(module, Constants):
+                constants.append(module.named())
+                continue
+            for name, parameter in module.named_parameters(path, recurse=False):
+                names = [f"{name} {k + 1}" for k in range(parameter.numel())]
+                constants.append(Named(names, ["1"] * len(names), parameter.flatten()))
+        return constants
+
+
 class PositiveConstants(Constants):
     """Log-normal constants start exp(spread z) + floor. z is zero at the start.
 

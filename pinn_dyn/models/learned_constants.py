@@ -13,10 +13,10 @@ from torch.nn.utils import parameters_to_vector
 
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.models.known_constants import Constants, Named
+from pinn_dyn.models.known_constants import HasConstants
 
 
-class LearnedConstants(MechanicalSystem):
+class LearnedConstants(HasConstants, MechanicalSystem):
     """Mechanical system whose parameters are :class:`~.known_constants.Constants`::
 
         e(q, v, a, u; z) = M a + C v + G + D v + F - A u - r = 0
@@ -45,18 +45,7 @@ class LearnedConstants(MechanicalSystem):
 
     def parameter_names(self) -> list[str]:
         """Return the meaning of each parameter, or the name of its attribute."""
-        names: list[str] = []
-        for path, module in self.named_modules():
-            if isinstance(module, Constants):
-                names += module.names
-                continue
-            for name, parameter in module.named_parameters(path, recurse=False):
-                names += [f"{name} {k + 1}" for k in range(parameter.numel())]
-        return names
-
-    def physical_constants(self) -> list[Named]:
-        """Return all constants in physical units."""
-        return [part.named() for part in self.modules() if isinstance(part, Constants)]
+        return [name for part in HasConstants.physical_constants(self) for name in part.names]
 
     def drive_gain(self) -> Tensor:
         """Return the gain k ``(N,)`` of each input: 1, unless gains are learned."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -32,7 +32,7 @@ class Linearization(NamedTuple):
     Attributes:
         z, q: latent coordinates ``(*batch, n)`` and configuration ``(*batch, N)`` at rest.
         stiffness: Hessian of V, ``(*batch, n, n)``.
-        input: df/du, ``(*batch, n, M)``.
+        input: df/du at du = 0, ``(*batch, n, M)``.
         output: dq/dx for x = (z, z'), ``(*batch, N, 2n)``.
     """
 
@@ -47,6 +47,18 @@ def _slopes(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """Return dy/dx ``(*batch, n, m)`` of y = f(x) ``(*batch, n)``, row by row."""
     rows = torch.func.vmap(torch.func.jacrev(function))(x.reshape(-1, x.shape[-1]))
     return rows.reshape(*x.shape[:-1], *rows.shape[1:])
+
+
+def _refuse_force_without_changes(
+    force: LinearAndMLP, state: dict[str, Tensor], prefix: str, *_: Any
+) -> None:
+    """Refuse the weights of a force of u alone, which earlier versions had."""
+    weight = state.get(f"{prefix}first.weight")
+    if weight is not None and weight.shape != force.first.weight.shape:
+        raise ValueError(
+            "the force of these oscillators is of an earlier form, without the change of the "
+            "inputs over a step: train the model again"
+        )
 
 
 class MeasuredCoordinates(nn.Module):
@@ -97,14 +109,16 @@ class HiddenStart(nn.Module):
 class CoupledOscillators(EncodedPredictor):
     r"""Oscillators in latent coordinates with stiffness, damping and coupling::
 
-        z'' = f(u) - K z - D z' - W^T tanh(W z + b)
+        z'' = f(u, du) - K z - D z' - W^T tanh(W z + b)
         V(z) = z^T K z / 2 + sum of log cosh(W z + b)
 
     Symbols: latent coordinates z ``(*batch, n)``; K and D ``(n, n)``, symmetric positive definite
-    by their Cholesky factors; W ``(n, n)``, b ``(n,)``; force f of the inputs, a linear map plus an
-    MLP. The unit of time is a step, that of mass is 1. The coupling is the slope of a convex
-    potential, so the system with a constant input has one equilibrium, which is globally stable,
-    and it is input-to-state stable.
+    by their Cholesky factors; W ``(n, n)``, b ``(n,)``; force f, a linear map plus an MLP, of the
+    mean u of the inputs at both ends of a step and of their change du over the step. Tendons rub
+    and valves throttle, so their force depends on the rate of the motors. At rest it is f(u, 0).
+    The unit of time is a step, that of mass is 1. The coupling is the slope of a convex potential,
+    so the system with a constant input has one equilibrium, which is globally stable, and it is
+    input-to-state stable.
 
     A step takes the forces at the mean of z at both ends, and the coupling by its slope at the
     start and the bound W^T W of its Hessian::
@@ -112,11 +126,11 @@ class CoupledOscillators(EncodedPredictor):
         w = (2 I + K/2 + D + W^T W/2)^-1 (2 z' + f - K z - W^T tanh(W z + b))
         z_{k+1} = z + w,      z'_{k+1} = 2 w - z',      w = (z' + z'_{k+1}) / 2
 
-    with f the mean of its values at both ends. For any parameters and any step, the energy
-    E = V(z) + z'^T z' / 2 changes by at most w^T f - w^T D w: the unforced system never gains
-    energy, since log cosh lies below its expansion with the Hessian bound. All rollouts are
-    bounded: the linear part x_{k+1} = A x_k, with the coupling as a force, decays to zero, and the
-    force is bounded by that of the inputs and by the norm of W.
+    For any parameters and any step, the energy E = V(z) + z'^T z' / 2 changes by at most
+    w^T f - w^T D w: the unforced system never gains energy, since log cosh lies below its expansion
+    with the Hessian bound. All rollouts are bounded: the linear part x_{k+1} = A x_k, with the
+    coupling as a force, decays to zero, and the force is bounded by that of the inputs, whose
+    changes are bounded with them, and by the norm of W.
 
     Source: Stölzle and Della Santina (2024), "Input-to-state stable coupled oscillator networks for
     closed-form model-based control in latent space". The encoder and the output are those of
@@ -147,7 +161,7 @@ class CoupledOscillators(EncodedPredictor):
         activation: Activation = "tanh",
         force_hidden: Sequence[PositiveInt] = (64,),
         output: Literal["network", "coordinates"] = "network",
-        fade: Annotated[float, Field(gt=0, lt=1)] = 0.5,
+        fade: Annotated[float, Field(gt=0, lt=1)] | None = None,
         initial_velocity: InitialVelocityHead | None = None,
     ):
         self._force_hidden = force_hidden
@@ -164,8 +178,6 @@ class CoupledOscillators(EncodedPredictor):
         speed = self.step * self.std[size : 2 * size] / self.std[:size]
         self.output = MeasuredCoordinates(n, speed.float())
         self.encoder = HiddenStart(self.output, len(self.mean), hidden, activation)
-        del self.fade
-        self.register_buffer("fade", torch.zeros(2 * size))
 
     def _add_transition(
         self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation
@@ -173,7 +185,8 @@ class CoupledOscillators(EncodedPredictor):
         n = latent // 2
         frequency = torch.linspace(math.log(_SLOWEST), math.log(_FASTEST), n)
         mixed = _SPREAD * torch.randn(2, n, n) / n**0.5
-        self.force = LinearAndMLP(inputs, n, self._force_hidden, activation)
+        self.force = LinearAndMLP(2 * inputs, n, self._force_hidden, activation)
+        self.force.register_load_state_dict_pre_hook(_refuse_force_without_changes)
         self.stiffness = nn.Parameter(torch.diag(frequency) + mixed[0].tril(-1))
         damping = (frequency + math.log(2 * _DAMPING)) / 2
         self.damping = nn.Parameter(torch.diag(damping) + mixed[1].tril(-1))
@@ -207,10 +220,14 @@ class CoupledOscillators(EncodedPredictor):
         """Return W^T tanh(W z + b), ``(*batch, n)``."""
         return torch.tanh(F.linear(z, self.coupling, self.bias)) @ self.coupling
 
+    def step_force(self, ends: Tensor) -> Tensor:
+        """Return f of the normalized inputs at the ends of a step, ``(*batch, 2M)``."""
+        start, end = ends.chunk(2, dim=-1)
+        return self.force(torch.cat([(start + end) / 2, end - start], dim=-1))
+
     def latent_force(self, u: Tensor) -> Tensor:
-        """Return f(u), ``(*batch, n)``, at u ``(*batch, M)``."""
-        size = self.num_inputs
-        return self.force((u - self._input_mean[:size]) / self._input_std[:size])
+        """Return f(u, 0), ``(*batch, n)``, at a constant u ``(*batch, M)``."""
+        return self.step_force((torch.cat([u, u], dim=-1) - self._input_mean) / self._input_std)
 
     def stiffness_at(self, z: Tensor) -> Tensor:
         """Return the Hessian of V, ``(*batch, n, n)``."""
@@ -307,10 +324,8 @@ class CoupledOscillators(EncodedPredictor):
     def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:
         n = len(self.bias)
         A, B = self.flow()
-        start, end = ends.chunk(2, dim=-1)
-        drives = F.linear((self.force(start) + self.force(end)) / 2, B)
         path = [z]
-        for drive in drives:
+        for drive in F.linear(self.step_force(ends), B):
             z = F.linear(z, A) + drive - F.linear(self.coupling_force(z[..., :n]), B)
             path.append(z)
         return path

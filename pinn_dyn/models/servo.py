@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from pinn_dyn import wording
 from pinn_dyn.mechanics.arrays import listed
 from pinn_dyn.models.input_matrix import InputMatrix
-from pinn_dyn.models.known_constants import Constants, Named
+from pinn_dyn.models.known_constants import Constants, HasConstants
 from pinn_dyn.models.scales import Scales
 
 _START = 10.0  # initial k in units of the typical force over the spread of q
@@ -22,7 +22,7 @@ _SHARPNESS = 8  # the force is 0.92 of its limit where the linear law reaches th
 _BEYOND = 1e3  # ratio to the limit beyond which the force is constant
 
 
-class Servo(InputMatrix):
+class Servo(HasConstants, InputMatrix):
     """Position servos with targets u, and optional feed-forward forces f::
 
         s = k (u - q) - d v + f,      tau = s / (1 + |s / L|^8)^(1/8)
@@ -150,11 +150,6 @@ class Servo(InputMatrix):
     def typical_force(self, u_rms: Tensor) -> Tensor:
         """Return a tenth of k times the spread of q, ``(N,)``, the force of a typical lag."""
         return self._force.to(u_rms)
-
-    def physical_constants(self) -> list[Named]:
-        """Return the learned constants in physical units."""
-        parts = self.stiffness, self.damping, self.limit
-        return [part.named() for part in parts if part is not None]
 
     def _linear_torque(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return s, ``(*batch, n)``."""

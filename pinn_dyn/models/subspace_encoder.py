@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import abc
 import itertools
+import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +18,9 @@ from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import Activation
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
+
+_TIMES = 4  # time constants of an offset of the start
+_SHARE_RATE = 10.0  # rate at which their shares are learned, times that of the weights
 
 
 class LinearAndMLP(nn.Module):
@@ -50,20 +54,30 @@ class LinearAndMLP(nn.Module):
         return y + h
 
 
+def _add_shares(model: nn.Module, state: dict[str, Tensor], *_: Any) -> None:
+    """Complete the weights of a model whose offset has one time constant."""
+    if "share" not in state and "fade" in state:
+        state["fade"] = state["fade"].unsqueeze(-1).repeat(1, _TIMES)
+        state["share"] = torch.zeros_like(state["fade"])
+
+
 class EncodedPredictor(Predictor):
     """State-space model with a latent state z that an encoder computes from the past::
 
         z_0 = encoder(q_0, v_0, q_-1, ... q_-n, u_0, ... u_-n)
-        y_k = output(z_k) + fade^k (y_0 - output(z_0)),      y = (q, v)
+        y_k = output(z_k) + kept_k (y_0 - output(z_0)),      y = (q, v)
+        kept_k = sum over j of share_j exp(-k h / tau_j)
 
-    Symbols: latent state z ``(*batch, latent)``, state y of the robot ``(*batch, 2N)``, fade
-    ``(2N,)``. y, q and u are normalized by their means and standard deviations. The encoder and the
-    output are sums of a linear map and an MLP. The last term starts the prediction at the measured
-    y_0. fade is learned, between 0 and 1. A learned v_0 replaces the measured one. Subclasses
-    define how z moves (:meth:`latent_path`).
+    Symbols: latent state z ``(*batch, latent)``, state y of the robot ``(*batch, 2N)``, step h.
+    y, q and u are normalized by their means and standard deviations. The encoder and the output are
+    sums of a linear map and an MLP. The last term starts the prediction at the measured y_0. Each
+    component of y has four time constants tau_j, initially from a step to the length of the
+    training windows, and their shares, whose sum is 1. Both are learned: a slow robot keeps what
+    the model does not explain, a fast one drops it. A learned v_0 replaces the measured one.
+    Subclasses define how z moves (:meth:`latent_path`).
 
     Unknown q and u before the start repeat the first sample: the robot was at rest. The memory of a
-    rollout is z and the fading term, see :meth:`start` and :meth:`next_state`.
+    rollout is z and the fading terms, see :meth:`start` and :meth:`next_state`.
 
     Source: Beintema, Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system
     identification". The fading term is not part of it.
@@ -74,8 +88,7 @@ class EncodedPredictor(Predictor):
             Pieces of a log keep 2 s.
         latent: size of z.
         hidden, activation: widths and activation of the hidden layers of all networks.
-        fade: initial value of fade. Trainings change it by little: 0.95 keeps an offset for two
-            seconds of steps of 0.1 s.
+        fade: initial exp(-h / tau_j) of all j; None takes tau_j from a step to the windows.
         initial_velocity: builder of the head for v_0.
     """
 
@@ -90,7 +103,7 @@ class EncodedPredictor(Predictor):
         latent: int,
         hidden: Sequence[PositiveInt],
         activation: Activation,
-        fade: float = 0.5,
+        fade: float | None = None,
         initial_velocity: InitialVelocityHead | None = None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
@@ -104,10 +117,16 @@ class EncodedPredictor(Predictor):
         self.encoder: nn.Module = LinearAndMLP(len(self.mean), latent, hidden, activation)
         self._add_transition(inputs, latent, hidden, activation)
         self.output: nn.Module = LinearAndMLP(latent, 2 * size, hidden, activation)
-        self.fade = nn.Parameter(torch.logit(torch.full((2 * size,), fade)))
+        longest = len(statistics.qv_increment_std)  # steps of a window
+        start = (-1 / torch.logspace(0, math.log10(longest), _TIMES)).exp()
+        if fade is not None:
+            start = torch.full_like(start, fade)
+        self.fade = nn.Parameter(torch.logit(start).repeat(2 * size, 1))
+        self.share = nn.Parameter(torch.zeros(2 * size, _TIMES))
         scales = Scales(statistics, statistics.v_std)
         self.initial_velocity = initial_velocity and initial_velocity(scales)
-        self.memory_size = latent + 2 * size
+        self.memory_size = latent + self.fade.numel()
+        self.register_load_state_dict_pre_hook(_add_shares)
 
     @abc.abstractmethod
     def _add_transition(
@@ -130,7 +149,7 @@ class EncodedPredictor(Predictor):
         return float(self.step)
 
     def start(self, q: Tensor, v: Tensor, u: Tensor, q_past: Tensor, u_past: Tensor) -> Tensor:
-        """Return the memory of a rollout, ``(*batch, latent + 2N)``: z and y - output(z).
+        """Return the memory of a rollout, ``(*batch, latent + 8N)``: z and parts of y - output(z).
 
         Args:
             q, v, u: present state and input, ``(*batch, N or M)``.
@@ -140,19 +159,26 @@ class EncodedPredictor(Predictor):
         start = start_of(self.initial_velocity, torch.cat([q, v], dim=-1), u)
         x = (torch.cat([start, q_past, u, u_past], dim=-1) - self.mean) / self.std
         z = self.encoder(x)
-        return torch.cat([z, x[..., : 2 * self.num_coordinates] - self.output(z)], dim=-1)
+        offset = x[..., : 2 * self.num_coordinates] - self.output(z)
+        parts = offset.unsqueeze(-1) * self._shares
+        return torch.cat([z, parts.flatten(-2)], dim=-1)
 
     def next_state(
         self, memory: Tensor, u: Tensor, u_next: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the memory, q and v a step later, from u at the start and the end of the step."""
         size = 2 * self.num_coordinates
-        z, offset = memory.tensor_split([memory.shape[-1] - size], dim=-1)
+        z, parts = memory.tensor_split([memory.shape[-1] - self.fade.numel()], dim=-1)
         ends = (torch.cat([u, u_next], dim=-1) - self._input_mean) / self._input_std
         z = self.latent_path(z, ends[None])[1]
-        offset = torch.sigmoid(self.fade) * offset
+        parts = torch.sigmoid(self.fade).flatten() * parts
+        offset = parts.unflatten(-1, (size, _TIMES)).sum(-1)
         y = self.mean[:size] + self.std[:size] * (self.output(z) + offset)
-        return torch.cat([z, offset], dim=-1), *y.chunk(2, dim=-1)
+        return torch.cat([z, parts], dim=-1), *y.chunk(2, dim=-1)
+
+    @property
+    def _shares(self) -> Tensor:
+        return torch.softmax(_SHARE_RATE * self.share, dim=-1)
 
     @property
     def _input_mean(self) -> Tensor:
@@ -183,7 +209,8 @@ class EncodedPredictor(Predictor):
         mean, std = self.mean[: 2 * size], self.std[: 2 * size]
         offset = (start.unsqueeze(-2) - mean) / std - y[..., :1, :]
         steps = torch.arange(len(t), device=t.device)[:, None]
-        moved = y - y[..., :1, :] + offset * (torch.sigmoid(self.fade) ** steps - 1)
+        lost = self._shares * (1 - torch.sigmoid(self.fade) ** steps.unsqueeze(-1))
+        moved = y - y[..., :1, :] - offset * lost.sum(-1)
         return std * moved + (steps > 0) * (start - measured).unsqueeze(-2)
 
 
@@ -204,7 +231,7 @@ class SubspaceEncoder(EncodedPredictor):
         latent: PositiveInt = 12,
         hidden: Sequence[PositiveInt] = (64,),
         activation: Activation = "tanh",
-        fade: Annotated[float, Field(gt=0, lt=1)] = 0.5,
+        fade: Annotated[float, Field(gt=0, lt=1)] | None = None,
     ):
         super().__init__(statistics, history, latent, hidden, activation, fade)
 

@@ -184,6 +184,12 @@ def _export_robot(model: Predictor, path: Path) -> Path:
                 ),
             ],
         )
+    for name, values in constants._asdict().items():
+        if name not in ("limit", "notes") and not values.isfinite().all():
+            raise ValueError(
+                f"{path}: {name} is {values.tolist()}, expected finite numbers; the dry friction "
+                "of a robot file has an upper limit"
+            )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, _WRITERS[path.suffix](chain, constants, path.parent))
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,11 +19,21 @@ from pinn_dyn.evaluation.external_torque import (
     contact_thresholds,
     link_wrench,
     observed_torques,
+    quiet_level,
+    settled,
 )
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 from pinn_dyn.systems import RigidChain
 
 _WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
+_DOUBT = 3.0  # ratio of the level of a frame's quiet part to that of quiet motion
+_TEXT = (
+    "%s: even its quiet part has %.2g times the external torque of quiet motion: the robot carries "
+    "a load, or signs, units, order, zero positions or clocks of columns are not those of the "
+    "training"
+)
+
+log = logging.getLogger(__name__)
 
 
 def external_torque(
@@ -42,7 +53,10 @@ def external_torque(
     motions: Sequence[Trajectory] = source.load().validation
     if quiet is not None:
         motions = [motion for _, motion in log_motions(source, quiet)]
-    levels = contact_thresholds(model, motions, bandwidth, false_alarms)
+    step = float(motions[0].t[1] - motions[0].t[0])
+    sizes = [settled(observed_torques(model, x, bandwidth)[0], step, bandwidth) for x in motions]
+    levels = contact_thresholds(sizes, step, bandwidth, false_alarms)
+    usual, doubtful = quiet_level(torch.cat(sizes), levels), []
     threshold = pd.Series(levels, index=source.labels)
     contacts: list[dict[str, object]] = []
     values: dict[str, np.ndarray] = {"time": np.full(len(frame), np.nan)}
@@ -50,6 +64,10 @@ def external_torque(
     for rows, raw, clean in source.recordings(frame):
         motion = _motion(source, clean)
         residual, drive = observed_torques(model, motion, bandwidth)
+        level = quiet_level(settled(residual, step, bandwidth), levels)
+        if level > _DOUBT * usual:
+            doubtful.append(clean.run)
+            log.warning(_TEXT, clean.run, level / usual)
         parts = {"measured": drive, "model": drive + residual, "external": residual}
         columns: dict[str, Any] = {
             f"{part} {label}": x
@@ -71,7 +89,8 @@ def external_torque(
     for name in {"contact", "ambiguous"} & set(table.columns):
         table[name] = table[name] > 0.5
     names = ["run", "start", "end", "joint", "torque"]
-    return ExternalTorque(table, threshold, pd.DataFrame(contacts, columns=names), bandwidth)
+    found = pd.DataFrame(contacts, columns=names)
+    return ExternalTorque(table, threshold, found, bandwidth, tuple(doubtful))
 
 
 def log_motions(source: LogSource, frame: pd.DataFrame) -> list[tuple[Recording, Trajectory]]:

@@ -6,13 +6,13 @@ import logging
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from pinn_dyn import wording
 from pinn_dyn.data import DataSource, LogSource
-from pinn_dyn.log_check.structure import compare_structure
+from pinn_dyn.log_check.check import verdict
+from pinn_dyn.log_check.input_faults import SATURATES
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models import KnownMechanics
 from pinn_dyn.run.build import ConfigError, ModelBuilder
@@ -45,7 +45,7 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
     key, units = _signals(source)[-1]
     columns = list(units)  # of servos, maybe, targets and feed-forward forces
     columns = columns[: len(names)] if len(columns) == 2 * len(names) else columns
-    inputs = _joints_of(columns, names)
+    inputs = joints_of(columns, names)
     if inputs is None:
         _log_order(key, columns, names)
     elif inputs != names:
@@ -79,7 +79,7 @@ def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
     key, units = signals[0]
     columns, names = list(units), structure.joint_names
     candidates = structure.tree.movable if structure.joints is None else names
-    joints = _joints_of(columns, candidates)
+    joints = joints_of(columns, candidates)
     if joints is None:
         _check_order(key, columns, structure)
     elif joints != names:
@@ -141,7 +141,7 @@ def check_known(model: KnownMechanics, source: DataSource) -> None:
         (key, list(q), names),
         *((input_key, x, driven) for x in halves),
     ):
-        if (order := _joints_of(columns, expected)) not in (None, expected):
+        if (order := joints_of(columns, expected)) not in (None, expected):
             raise ConfigError(
                 f"{name} has the order {', '.join(columns)}, and the model the joints "
                 f"{', '.join(expected)}: build it with joints={order} or driven_joints={order}"
@@ -161,18 +161,16 @@ def check_known(model: KnownMechanics, source: DataSource) -> None:
             )
 
 
-def warn_of_structure(model: KnownMechanics, source: DataSource) -> None:
-    """Warn if the URDF of known mechanics contradicts the log, with the likely cause."""
-    if not isinstance(source, LogSource) or model.servo:
+def warn_of_log(model: Any, source: DataSource) -> None:
+    """Warn of what the check of the log finds: whether it contradicts itself or the URDF."""
+    if not isinstance(source, LogSource):
         return
-    size = len(source.u.columns)
-    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
-    training = [replace(item, u=item.u[:, :size]) for item in training]
-    step = training[0].sample_time("a comparison with the URDF")
-    structure = double_copy(model).structure
-    for item in compare_structure(structure, training, (), source.u, step):
-        if item.verdict != "ok":
-            log.warning("%s: %s", source.name, item.text)
+    known = isinstance(model, KnownMechanics) and not model.servo
+    structure = double_copy(model).structure if known else None
+    is_limited = known and model.limits is not None
+    for text in verdict(source, structure):
+        if not (is_limited and SATURATES in text):
+            log.warning("%s: %s", source.name, text)
 
 
 def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
@@ -198,7 +196,7 @@ def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
     return signals
 
 
-def _joints_of(columns: Sequence[str], joints: Sequence[str]) -> list[str] | None:
+def joints_of(columns: Sequence[str], joints: Sequence[str]) -> list[str] | None:
     """Return the joint of each column, or None unless the columns name different joints.
 
     A column contains the name of its joint. Otherwise the names of joints may end as the columns do

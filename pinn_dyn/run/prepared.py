@@ -20,7 +20,7 @@ from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
 from pinn_dyn.run.build import ConfigError, ModelBuilder, build_predictor, naming
-from pinn_dyn.run.known_data import check_known, warn_of_structure
+from pinn_dyn.run.known_data import check_known, warn_of_log
 from pinn_dyn.run.provenance import provenance
 from pinn_dyn.run.run import TRAJECTORIES, Run
 from pinn_dyn.run.run_folder import (
@@ -140,7 +140,7 @@ def prepare(
     known = predictor.known if isinstance(predictor, KnownAndNetwork) else predictor
     if isinstance(known, KnownMechanics):
         check_known(known, source)
-        warn_of_structure(known, source)
+    warn_of_log(known, source)
     if start_from is not None and not saved:
         _take_weights(predictor, start_from)
     facts = {"name": config["name"], "seed": config["seed"], "pairs": len(windows.windows)}

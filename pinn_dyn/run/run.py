@@ -41,6 +41,7 @@ from pinn_dyn.run.build import build_source
 from pinn_dyn.run.export import export, export_samples
 from pinn_dyn.run.external_torque import external_torque, log_motions
 from pinn_dyn.run.predict_frame import predict_frame
+from pinn_dyn.whole import whole
 
 TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""
@@ -158,10 +159,10 @@ class Run:
 
     def save(self, folder: str | Path) -> None:
         """Copy the run folder to a new one, with the data of a source that was made in Python."""
-        target = Path(folder).expanduser()
-        shutil.copytree(self.folder, target, ignore=shutil.ignore_patterns(".lock"))
-        if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
-            store(self._made_in_python, target / TRAJECTORIES)
+        with whole(Path(folder).expanduser()) as target:
+            shutil.copytree(self.folder, target, ignore=shutil.ignore_patterns(".lock"))
+            if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
+                store(self._made_in_python, target / TRAJECTORIES)
 
     def sample(self, n: int, seed: int = 0) -> list[Predictor]:
         """Draw robots from the posterior of the constants that least squares fitted.

@@ -136,7 +136,8 @@ class DynamicsLearner(L.LightningModule):
         period = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if period and self.global_step % period == 0:
             losses = torch.stack(self._losses[-period:]).mean(0)
-            figures = {name: float(x) for name, x in self.loss_figures(losses).items()}
+            reduce = trainer.strategy.reduce  # mean over processes
+            figures = {name: float(reduce(x)) for name, x in self.loss_figures(losses).items()}
             for logger in trainer.loggers:
                 logger.log_metrics(figures, self.global_step - 1)
         if before + done >= trainer.num_training_batches:

@@ -262,6 +262,24 @@ def test_a_fitted_run_can_be_saved_loaded_and_evaluated(model, tmp_path):
     assert "lnn" in (out / "summary.csv").read_text()
 
 
+def test_a_run_that_does_not_fit_on_the_disk_leaves_no_folder(lnn_run, tmp_path):
+    """A limit of the size of files stands for the full disk."""
+    resource = pytest.importorskip("resource", reason="there are no limits of files here")
+    run, limits = pinn_dyn.load(lnn_run), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            run.save(tmp_path / "saved")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
+    run.save(tmp_path / "saved")
+    pinn_dyn.load(tmp_path / "saved")
+    with pytest.raises(OSError, match="saved"):
+        run.save(tmp_path / "saved")
+    assert [x.name for x in tmp_path.iterdir()] == ["saved"]
+
+
 def test_a_cleaning_step_reaches_the_prediction(tmp_path):
     run = fit(cleaning={"smooth": MovingAverage(3, signals=["u"])})
     run.save(tmp_path / "run")

@@ -4,6 +4,7 @@ import re
 import runpy
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -71,9 +72,25 @@ def trained(*words):
 
 
 def friction_head(run):
+    import pinn_dyn
+
     model = trained("model/friction=drag").model
     v = torch.tensor([[2.0, -2.0, 0.0]])
     torch.testing.assert_close(model.friction(2 * v), 4 * model.friction(v))
+    from pinn_dyn.models import Drag, KnownMechanics
+    from pinn_dyn.systems import RigidChain
+    from pinn_dyn.training import LeastSquares
+
+    t, urdf = np.arange(0, 20, 0.02), str(ROOT / "examples" / "double_pendulum.urdf")
+    wave = {f"{x}{k}": np.sin((k + 0.3) * t + k) for x in "qu" for k in (1, 2)}
+    known = partial(KnownMechanics, structure=RigidChain(urdf), friction=Drag)
+    solver = LeastSquares(cutoff=6.0, rollouts=False)
+    names = {"q": ["q1", "q2"], "u": ["u1", "u2"]}
+    fitted = pinn_dyn.fit(pd.DataFrame(wave | {"t": t}), **names, model=known, optimizer=solver)
+    table = pd.read_csv(fitted.folder / "constants.csv")
+    assert table.name.str.startswith("drag of").sum() == 2
+    with pytest.raises(ValueError, match=r"friction is .*inf.* expected finite numbers"):
+        fitted.export("arm.xml")
 
 
 def loss(run):
@@ -125,6 +142,8 @@ def export_target(run):
     model.export("arm.ts", "forward_dynamics")
     q, v, u = torch.rand(3, 3, generator=torch.manual_seed(0)).double()
     (a,) = torch.jit.load("arm.ts")(q, v, u)
+    with pytest.raises(ValueError, match="set real='double'"):
+        model.export("float.ts", "forward_dynamics", real="float")
     torch.testing.assert_close(a, torch.as_tensor(model.forward_dynamics(q, v, u)))
 
 

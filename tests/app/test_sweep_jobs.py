@@ -12,6 +12,7 @@ import yaml
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pinn_dyn.app.sweep import SweepCallback
 from tests.app.entry import (
@@ -202,6 +203,12 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
         assert record(folder)["steps"] == 50
 
 
+def scalars(folder, name):
+    """Values of a scalar in the TensorBoard log of a run, in order."""
+    events = EventAccumulator(str(folder / "tensorboard")).Reload()
+    return [item.value for item in events.Scalars(name)]
+
+
 @pytest.mark.slow
 def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
     """Of a sweep each job starts two, which import PyTorch."""
@@ -224,6 +231,9 @@ def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
         assert record(together)["steps"] == two["global_step"] == one["global_step"] == 5
         for key, value in one["state_dict"].items():
             assert torch.allclose(two["state_dict"][key], value, rtol=1e-4, atol=1e-6), key
+        losses = [scalars(path, "train/loss") for path in (alone, together)]
+        assert len(losses[0]) == 5
+        assert losses[1] == pytest.approx(losses[0], rel=1e-4)
         errors = [record(path)["validation"]["val/error_mean"] for path in (alone, together)]
         assert errors[0] == pytest.approx(errors[1], rel=1e-4)
         assert len(list((together / "tensorboard").glob("events*"))) == len(

@@ -203,6 +203,10 @@ FORMATS = {
         lambda path, table: table.to_json(path, orient="records", double_precision=15),
         {},
     ),
+    "marked.json": (
+        lambda path, table: path.write_text("\ufeff" + table.to_json(orient="records"), "utf-8"),
+        {},
+    ),
     "vectors.json": (functools.partial(write_json, form=records), NESTED),
     "jsonl": (functools.partial(write_json, form=records), NESTED),
     "mcap": (write_bag_file, BAG),

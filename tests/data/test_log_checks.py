@@ -18,6 +18,8 @@ from pinn_dyn.data.logs import (
 )
 from pinn_dyn.data.logs.check.checks import _are_ticks
 from pinn_dyn.data.logs.registers import rows_before_first_sample
+from pinn_dyn.log_check.check import check
+from pinn_dyn.log_check.runs import INERTIA
 from tests.data.logs_files import motion, source, write
 
 RESAMPLE = {"resample": Resample(rate=100.0, max_gap=0.2)}
@@ -33,6 +35,14 @@ def refused(folder, table, message, **changes):
 def warned(folder, table, **changes):
     write(folder, table)
     return "\n".join(source(folder, **changes).warnings)
+
+
+def checked(folder, table):
+    """Texts of the check of a log about units of angles and signs of forces."""
+    write(folder, table)
+    names = ("largest angle [rad]", INERTIA)
+    found = [x for x in check(source(folder)).measurements if x.verdict != "ok"]
+    return "\n".join(x.text for x in found if x.name in names)
 
 
 def warned_of_runs(folder, runs):
@@ -88,7 +98,7 @@ BAD = {
     "repeat": (clock(repeat), r"line 402, column 't': the time repeats from 3.99.*Deduplicate"),
     "jump": (clock(lambda t: np.where(t > 3, t + 1, t)), r"line 303.*from 3 to 4.01.*SplitGaps"),
     "jitter": (clock(lambda t: t + 0.004 * np.sin(40 * t)), r"needs a uniform clock.*Resample"),
-    "bursts": (in_bursts(), r"line 3, column 't': .* repeats .*RowClock \(rate: .*, longest: "),
+    "bursts": (in_bursts(), r"line 3, column 't': .* repeats .*RowClock.rate=.*, longest="),
     "empty": (motion()[:0], r"has no rows"),
     "short": (motion(2.0), r"too short to keep 2.0 s for test"),
     "wraps": (wrapped(2 * np.pi), r"run.csv, line \d+, column 'q2' \(q\): the angle wraps from"),
@@ -278,11 +288,9 @@ WARNED = {
     "v halved": (changed(v2=V2 / 2), [V + "2 times.*unit, scale and sign"]),
     "still": (changed(q1=0.3, v1=0.0), [r"^column 'q1' \(q\): moves no more than its noise"]),
     "only noise": (changed(q1=1e-3 * NOISE[0], v1=NOISE[1]), ["than its noise, 0.000997"]),
-    "degrees": (changed(q2=np.degrees(Q2), v2=np.degrees(V2)), ["^run, column 'q2': an angle of "]),
+    "degrees": (changed(q2=np.degrees(Q2), v2=np.degrees(V2)), []),
     "inputs": (changed(u1=1.0, u2=0.0), ["'u1' is constant", "'u2' is constant"]),
     "pushed": (PUSHED, []),
-    "random force": (random_force(1), []),
-    "reversed force": (random_force(-1), ["input 'u1' seems to push backwards"]),
     "rest": (resting(), ["rest for 95 % of the training", "100 %", "100 %", *AGAIN]),
     "ticks": (ticks(), AGAIN),
     "ticks, -1": (
@@ -307,7 +315,7 @@ WARNED = {
     ),
     "q often -999": (
         with_placeholders(motion(), MANY, "q2", -999.0),
-        [r"column 'q2' .* -999 .*'no v", "in degrees", "120.3 times", "than its noise"],
+        [r"column 'q2' .* -999 .*'no v", "120.3 times", "than its noise"],
     ),
 }
 
@@ -321,6 +329,13 @@ def test_a_fault_gets_its_warnings_and_no_others(tmp_path, fault):
         assert re.search(pattern, line)
 
 
+def test_the_check_names_degrees_and_a_reversed_force(tmp_path):
+    degrees = changed(q2=np.degrees(Q2), v2=np.degrees(V2))
+    assert re.match("run, column 'q2': an angle of ", checked(tmp_path, degrees))
+    assert checked(tmp_path, random_force(1)) == ""
+    assert "input 'u1' seems to push backwards" in checked(tmp_path, random_force(-1))
+
+
 def test_a_joint_that_turns_many_times_is_not_in_degrees(tmp_path):
     """A pendulum that turns over and back, and a wheel that rolls on; in degrees they swing."""
     rows = [(0.0, 9.0)]
@@ -332,9 +347,9 @@ def test_a_joint_that_turns_many_times_is_not_in_degrees(tmp_path):
     wheel = 5 * T + np.sin(T)
     table = motion().assign(q1=q[:1001], v1=v[:1001], q2=wheel, v2=5 + np.cos(T))
     assert np.ptp(q[:1001]) > 4 * np.pi
-    assert "degrees" not in warned(tmp_path, table)
-    assert warned(tmp_path, motion().assign(q1=628 * T, v1=628.0)) == ""  # 6.28 rad in each row
-    assert "'q1': an angle" in warned(tmp_path, motion().assign(q1=50 * motion()["q1"]))
+    assert "degrees" not in checked(tmp_path, table)
+    assert checked(tmp_path, motion().assign(q1=628 * T, v1=628.0)) == ""  # 6.28 rad in each row
+    assert "'q1': an angle" in checked(tmp_path, motion().assign(q1=50 * motion()["q1"]))
 
 
 def test_a_free_motor_that_goes_to_and_fro_is_not_in_degrees(tmp_path):
@@ -350,8 +365,8 @@ def test_a_free_motor_that_goes_to_and_fro_is_not_in_degrees(tmp_path):
     q, v, u = np.transpose(rows[:100_001:100])
     assert 50 < np.abs(q).max() < 180
     table = motion().assign(q1=q + 1e-3 * rng.normal(size=1001), v1=v, u1=u)
-    assert "in degrees" not in warned(tmp_path, table)
-    assert "'q1': an angle" in warned(tmp_path, table.assign(u1=np.roll(u, 300)))
+    assert "in degrees" not in checked(tmp_path, table)
+    assert "'q1': an angle" in checked(tmp_path, table.assign(u1=np.roll(u, 300)))
 
 
 @pytest.mark.parametrize("part", ["validation", "test"])

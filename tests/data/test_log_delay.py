@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import DelayCurve, InputDelay, Recording, clear_delays, input_delays
+from pinn_dyn.data.logs import InputDelay, Recording
+from pinn_dyn.log_check.delay import DelayCurve, clear_delays, input_delays
 from tests.support.delayed_robots import log, seven_regressor, sines
 
 

@@ -2,7 +2,9 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
+import scipy
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -266,6 +268,34 @@ def test_an_automatic_stride_is_a_tenth_of_a_period_at_any_rate(rate, fastest, s
     data = make_data(stride="auto")
     data.splits = dataclasses.replace(data.splits, train=[Trajectory(q, q, Signal(t, white))])
     assert data.step == pytest.approx(step, abs=0.3 / rate)
+
+
+def automatic_step(q, u, step):
+    data = make_data(stride="auto")
+    t = step * torch.arange(len(q), dtype=torch.float64)
+    item = Trajectory(torch.from_numpy(q), torch.from_numpy(q), Signal(t, torch.from_numpy(u)))
+    data.splits = dataclasses.replace(data.splits, train=[item])
+    return data.step
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.01, 0.03])
+@pytest.mark.parametrize("hold", [1, 5, 8])
+@pytest.mark.parametrize(("fastest", "step"), [(1.5, 0.1), (3.0, 0.05)])
+def test_an_automatic_stride_ignores_noise_and_held_inputs(fastest, step, hold, noise):
+    rng, t = np.random.default_rng(0), np.arange(6000) / 100
+    waves = np.linspace(0.1, fastest, 8)[:, None]
+    u = np.sin(2 * np.pi * t[:, None, None] * waves + rng.uniform(0, 6, (8, 2))).sum(axis=1)
+    q = u + 0.1 * u**2
+    q = q + noise * q.std(axis=0) * rng.normal(size=q.shape)
+    assert automatic_step(q, u[np.arange(6000) // hold * hold], 0.01) == pytest.approx(step)
+
+
+def test_commands_that_jump_leave_the_step_to_the_motion():
+    """Random positions, each held for 2 s, move an oscillator of 2 Hz."""
+    u = np.random.default_rng(0).normal(size=(30, 1)).repeat(200, axis=0)
+    w = 2 * np.pi * 2.0
+    q = scipy.signal.lsim(([w**2], [1, 0.4 * w, w**2]), u[:, 0], np.arange(6000) / 100)[1]
+    assert automatic_step(q[:, None], u, 0.01) == pytest.approx(0.05)
 
 
 def slow_in_the_middle(samples=60_000):

@@ -60,6 +60,30 @@ def test_all_draws_explain_the_data_and_all_bodies_can_exist(fitted):
     assert (masses.std(0) > 0.05 * masses.mean(0)).all()
 
 
+def test_the_common_factor_of_learned_gains_is_log_normal_about_the_fit():
+    """All gains as from N(z, C), of which they are exponentials; inputs as in the data."""
+    pytest.importorskip("pinocchio", reason="the dev extra is not installed")
+    springs = {"springs": ["shoulder"]}
+    model = KnownMechanics(
+        statistics(2), RigidChain(ARM), friction=CoulombFriction, gain_spread=0.5, **springs
+    )
+    solver = LeastSquares(cutoff=6.0, rollouts=False, samples=1000)
+    motion = recording(0)
+    covariance = solver.fit(model, [motion]).covariance
+    model = model.double().requires_grad_(False)
+    draws = sampled_models(model, covariance, COUNT, 0)
+    rows = [k for k, name in enumerate(model.parameter_names()) if "drive gain" in name]
+    deviation = 0.5 * float(covariance[rows][:, rows].mean()) ** 0.5
+    gains = torch.stack([(x.gain() / model.gain()).log().mean() for x in draws])
+    assert deviation > 0.2
+    assert float(gains.mean()) == pytest.approx(0.0, abs=3 * deviation / COUNT**0.5)
+    assert float(gains.std()) == pytest.approx(deviation, rel=0.15)
+    at = states(motion)
+    expected, *inputs = (x.inverse_dynamics(*at) / x.input_gain() for x in (model, *draws))
+    error = (torch.stack(inputs) - expected) / expected.std(0)
+    assert error.square().mean().sqrt() < 0.02
+
+
 def test_the_spread_is_that_of_the_posterior_where_no_body_is_near_its_limit():
     model = known_model(friction=None, spread=0.3).requires_grad_(False)
     size = sum(x.numel() for x in model.parameters())

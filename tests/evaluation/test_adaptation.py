@@ -5,8 +5,10 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+import scipy
 
 import pinn_dyn
+from pinn_dyn.identification.adaptation import _noise
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares
@@ -62,6 +64,16 @@ def test_friction_that_does_not_change_stays(run):
     assert inside.mean() > 0.8
     offsets = late[late["name"].str.startswith("torque offset")]
     assert np.abs(offsets.value).max() < 0.1
+
+
+def test_the_noise_of_correlated_errors_gives_the_error_of_their_mean():
+    """Against the spread of the means of many AR(1) series with the correlation 0.8."""
+    generator = np.random.default_rng(0)
+    innovations = generator.normal(size=(300, 1500))
+    series = scipy.signal.lfilter([1.0], [1.0, -0.8], innovations, axis=1)[:, 500:]
+    rows = np.ones((1000, 1))
+    noise = np.mean([_noise(rows, y) for y in series])
+    assert noise / 1000**0.5 == pytest.approx(series.mean(axis=1).std(), rel=0.1)
 
 
 def test_models_without_drives_are_refused(run):

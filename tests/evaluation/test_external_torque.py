@@ -10,7 +10,12 @@ import pytest
 import torch
 
 import pinn_dyn
-from pinn_dyn.evaluation.external_torque import contact_thresholds, link_wrench, observed_torques
+from pinn_dyn.evaluation.external_torque import (
+    contact_thresholds,
+    link_wrench,
+    observed_torques,
+    settled,
+)
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.systems import RigidChain
@@ -97,6 +102,34 @@ def test_a_push_at_the_tool_is_found_with_its_force(run):
     assert not pushed.ambiguous.any()
 
 
+def rolled(frame, columns, change):
+    return frame.assign(**dict(zip(columns, change(frame[columns].to_numpy()).T, strict=True)))
+
+
+def test_frames_whose_quiet_part_does_not_fit_the_model_are_named(run, caplog):
+    """A push of half of the time is fine."""
+    q, v, u = NAMES
+    frame = log(1, 12.0, contact=7.0)
+    pushed = rolled(
+        frame, u, lambda x: x - np.array([3.0, 5.0, 2.0]) * (frame.t.to_numpy()[:, None] > 6)
+    )
+    wrong = {
+        "reversed": rolled(frame, u, np.negative),
+        "one reversed": rolled(frame, u[2:], np.negative),
+        "mNm": rolled(frame, u, lambda x: 1000 * x),
+        "degrees": rolled(rolled(frame, q, np.rad2deg), v, np.rad2deg),
+        "exchanged": rolled(frame, u[:2], np.fliplr),
+        "homed elsewhere": rolled(frame, q[1:2], lambda x: x + 0.2),
+        "offset": rolled(frame, u[1:2], lambda x: x + 3),
+        "50 ms late": rolled(frame, u, lambda x: np.roll(x, 10, 0)),
+    }
+    for name, x in {"right": frame, "pushed": pushed, **wrong}.items():
+        caplog.clear()
+        result = run.external_torque(x, bandwidth=BANDWIDTH)
+        assert bool(result.doubtful) == (name in wrong), name
+        assert ("even its quiet part" in caplog.text) == (name in wrong), name
+
+
 def test_a_minute_of_free_motion_gives_no_alarm(run):
     result = run.external_torque(log(2, 60.0), bandwidth=BANDWIDTH)
     assert result.contacts.empty
@@ -107,10 +140,17 @@ def test_a_minute_of_free_motion_gives_no_alarm(run):
 def test_stiction_is_no_external_torque(run):
     """Thresholds contain all friction levels if the friction at rest is left out."""
     quiet = run.source.load().validation
-    with_rest = contact_thresholds(run.system, quiet, BANDWIDTH, 1.0)
+
+    def thresholds():
+        step = float(quiet[0].t[1] - quiet[0].t[0])
+        sizes = (observed_torques(run.system, x, BANDWIDTH)[0] for x in quiet)
+        sizes = [settled(x, step, BANDWIDTH) for x in sizes]
+        return contact_thresholds(sizes, step, BANDWIDTH, 1.0)
+
+    with_rest = thresholds()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pinn_dyn.evaluation.external_torque.rest_speeds", lambda model: None)
-        without = contact_thresholds(run.system, quiet, BANDWIDTH, 1.0)
+        without = thresholds()
     assert (with_rest < 0.5 * without).all()
 
 
@@ -142,6 +182,16 @@ def test_the_wrench_at_a_link_repeats_the_torques_of_a_force_and_moment():
     assert not ambiguous.any()
     stretched = torch.zeros_like(q)
     assert link_wrench(chain, stretched, torque, moment=True)[1].all()
+
+
+def test_a_force_that_no_joint_feels_is_ambiguous_instead_of_not_a_number():
+    """The origin of a link on the axis of its joint."""
+    chain = RigidChain(PANDA, joints=JOINTS, tip="panda_link1")
+    q = torch.rand(4, 3, generator=torch.Generator().manual_seed(0)).double()
+    assert not chain.tip_jacobian(q)[:, :3].any()
+    force, ambiguous = link_wrench(chain, q, torch.ones_like(q), moment=False)
+    assert not force.any()
+    assert ambiguous.all()
 
 
 def test_a_held_input_acts_until_the_next_sample():
@@ -203,8 +253,10 @@ def test_the_load_of_a_ur10e_is_found(tmp_path):
     for name in ("fourier_14_harmonics_50s", "point_to_point"):
         free = run.external_torque(pd.read_csv(folder / f"{name}.csv"), bandwidth=10.0)
         assert free.contacts.empty
+        assert not free.doubtful
     loaded = pd.read_csv(folder / "payload_fourier_14_harmonics_50s.csv")
     result = run.external_torque(loaded, bandwidth=10.0, link="tool0", moment=True)
     assert result.table.contact.mean() > 0.8
+    assert result.doubtful
     weight = -result.table.fz[~result.table.ambiguous].median()
     assert weight / 9.81 == pytest.approx(run.identify_payload(loaded).value[0], rel=0.1)

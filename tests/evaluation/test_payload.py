@@ -8,6 +8,7 @@ from pinn_dyn.identification.payload import identify_payload
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownMechanics
 from pinn_dyn.systems import RigidChain
+from pinn_dyn.training import LeastSquares
 from tests.support.arm_urdf import changed
 from tests.support.known import statistics
 
@@ -75,6 +76,37 @@ def test_a_number_that_the_motions_do_not_determine_is_named():
     assert table.determined[hidden].eq("not determined").all()
     assert table.determined[["mass", "center x", "center z", "Iyy"]].eq("yes").all()
     assert table.value["mass"] == pytest.approx(MASS, rel=0.02)
+
+
+def test_frames_that_contradict_the_training_are_named(caplog):
+    """With a load; right frames stay silent, and a removed load has a negative mass."""
+    structure = RigidChain(ARM)
+    model = KnownMechanics(statistics(2), structure, start="generic", friction=CoulombFriction)
+    heavy = (MASS, CENTER, INERTIA)
+    without, loaded = recording(0), recording(1000, heavy)
+    solver = LeastSquares(cutoff=6.0, rollouts=False, samples=1000)
+    solver.fit(model, [without])
+    flip = torch.tensor([1.0, -1.0]).double()
+    q, v, u = loaded.q, loaded.v, loaded.u
+    frames = {
+        "right": (q, v, u),
+        "reversed": (q, v, -u),
+        "one reversed": (q, v, flip * u),
+        "degrees": (180 / torch.pi * q, 180 / torch.pi * v, u),
+        "exchanged": (q, v, u.flip(1)),
+        "homed elsewhere": (q + 0.3, v, u),
+        "20 ms late": (q, v, u.roll(2, 0)),
+    }
+    for name, (*state, force) in frames.items():
+        caplog.clear()
+        frame = Trajectory(*state, Signal(loaded.t, force))
+        table = identify_payload(model, [without], [frame], cutoff=6.0, samples=1000)
+        assert ("no load explains" in caplog.text) == (name != "right"), name
+        assert (table.determined == "contradicted").all() == (name != "right"), name
+    solver.fit(model, [loaded])
+    table = identify_payload(model, [loaded], [without], cutoff=6.0, samples=1000)
+    assert "its mass is at most -0.8" in caplog.text
+    assert table.value[0] == pytest.approx(-MASS, rel=0.02)
 
 
 @pytest.mark.slow

@@ -134,9 +134,10 @@ def test_motion_capture(home):
     assert "q = (mass:X [m], mass:Z [m])" in run("motion_capture.py", "--steps", "2")
 
 
-def test_saturated_drive():
+def test_saturated_drive(caplog):
     without, curve = re.findall(r"m c = (\S+) kg m", run("saturated_drive.py"))
     assert abs(float(curve) - 0.3) < 0.005 < 0.3 < float(without) - 0.3
+    assert caplog.text.count("input 'tau' is a command that its drive cannot follow") == 1
 
 
 def test_warm_up(home):

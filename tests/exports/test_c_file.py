@@ -2,8 +2,10 @@
 
 import json
 import logging
+import os
 import re
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -94,11 +96,23 @@ def test_code_that_does_not_return_ends_with_a_message(tmp_path, monkeypatch, co
 def test_a_number_that_is_not_finite_differs_from_every_number(value):
     """On either side: in the file, or in the original."""
     with pytest.raises(RuntimeError, match="sine: y differs from the original"):
-        SINE.compare(lambda x: [np.full((200, 1), value)], 1e9)
-    broken = ExportedFunction("broken", lambda x: value * x, SINE.inputs, "y")
+        SINE.compare(lambda x: [np.full((200, 1), value)], "double")
+
+    def half(x):
+        return np.where(x > 0, value, x)
+
+    broken = ExportedFunction("broken", lambda x: torch.from_numpy(half(x)), SINE.inputs, "y")
     with pytest.raises(RuntimeError, match="broken: y differs from the original"):
-        broken.compare(lambda x: [x], 1e9)
-    broken.compare(lambda x: [value * x], 1e-9)
+        broken.compare(lambda x: [x], "double")
+    broken.compare(lambda x: [half(x)], "double")
+
+
+def test_a_file_of_another_type_or_without_finite_numbers_is_refused(tmp_path):
+    with pytest.raises(RuntimeError, match=r"200 finite .* is float64 in the file, expected float"):
+        SINE.compare(lambda x: [np.sin(x)], "float")
+    broken = ExportedFunction("broken", lambda x: torch.nan * x, SINE.inputs, "y")
+    with pytest.raises(RuntimeError, match="broken: y has 0 finite values of 200"):
+        write([broken], tmp_path / "f.c", {})
 
 
 def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
@@ -113,6 +127,21 @@ def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
     with caplog.at_level(logging.WARNING):
         write([SINE], tmp_path / "f.c", {})
     assert not caplog.text
+
+
+def test_a_compiler_with_an_open_quote_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "gcc -DNAME='a")
+    assert_refused(tmp_path, r"CC is .* expected the command of a C compiler", ValueError)
+
+
+def test_folders_of_exports_that_were_killed_are_removed(tmp_path):
+    """After a day, as another program may still write to a newer one."""
+    for name, age in (("old", 90_000), ("new", 60)):
+        folder = tmp_path / f".export-{name}"
+        folder.mkdir()
+        os.utime(folder, (time.time() - age, time.time() - age))
+    write([SINE], tmp_path / "f.c", {})
+    assert sorted(x.name for x in tmp_path.iterdir()) == [".export-new", "f.c", "f.h"]
 
 
 class Bessel(torch.nn.Module):

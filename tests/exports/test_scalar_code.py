@@ -84,7 +84,9 @@ class Odd(LinearSystem):
 
     def _potential_force(self, q):
         limited = torch.maximum(torch.sqrt(q + 0.2), 0 * q + 0.4).minimum(q.exp())
-        reversed_limits = torch.minimum(0.1 + 0 * q, torch.log(q + 0.3))
+        # NaN in the first operand below -0.2, and in the second in (0.3, 0.5) and above 0.6.
+        reversed_limits = torch.minimum(0.1 + 0 * q, torch.sqrt((q - 0.3) * (q - 0.5)))
+        reversed_limits = reversed_limits + torch.maximum(0.1 + 0 * q, torch.log(0.6 - q))
         other = torch.atan2(q, q + 2) + (q.abs() + 1) ** q + torch.fmod(q, 0.3)
         return limited + reversed_limits + other + torch.sigmoid(3 * q) + torch.sign(q)
 

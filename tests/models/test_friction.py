@@ -95,19 +95,23 @@ def test_every_law_is_in_the_table_of_known_mechanics(law):
     assert "friction width of slide" in rows
 
 
-def test_parameters_of_an_own_head_have_names_too():
+def test_parameters_of_an_own_head_are_in_the_table_too():
     """So a fit with a head that is no law of the package ends in a table, not in an error."""
 
     class Cubic(NoFriction):
         def __init__(self, scales):
             super().__init__(scales)
             self.factor = torch.nn.Parameter(torch.zeros(scales.size))
+            self.rate = scales.positive("drag", 0.1, scales.value, 1.0, ["Nms/rad"] * scales.size)
 
     model = known_model(friction=None)
     model.friction = Cubic(unit_scales(4))
     names = model.parameter_names()
-    assert names[-4:] == [f"friction.factor {k}" for k in range(1, 5)]
+    assert names[-8:-4] == [f"friction.factor {k}" for k in range(1, 5)]
     assert len(names) == sum(p.numel() for p in model.parameters())
+    rows = [name for item in model.physical_constants() for name in item.names]
+    assert len(rows) == len(names)
+    assert rows[-8:] == [f"factor {k}" for k in range(1, 5)] + names[-4:]
 
 
 def test_reported_friction_is_what_acts():

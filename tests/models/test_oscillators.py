@@ -12,7 +12,7 @@ from pinn_dyn.mechanics import Signal
 from pinn_dyn.models import CoupledOscillators, LearnedVelocity
 from pinn_dyn.testing import assert_near
 from tests.models.builders import STEP, make_statistics
-from tests.models.test_subspace_encoder import network
+from tests.models.test_subspace_encoder import faded, network
 
 N = 4
 
@@ -47,7 +47,8 @@ def test_a_step_solves_the_equation_of_motion_at_the_mean_state():
     x = network(model.encoder, (np.concatenate([x0.numpy(), u[0].numpy()]) - mean) / std)
     y = [network(model.output, x)]
     for k in range(5):
-        force = (network(model.force, ends[k]) + network(model.force, ends[k + 1])) / 2
+        mean_and_change = [(ends[k] + ends[k + 1]) / 2, ends[k + 1] - ends[k]]
+        force = network(model.force, np.concatenate(mean_and_change))
         z, v = np.split(x, 2)
 
         def residual(later, z=z, v=v, force=force):
@@ -58,12 +59,19 @@ def test_a_step_solves_the_equation_of_motion_at_the_mean_state():
 
         x = scipy.optimize.root(residual, x, tol=1e-13).x
         y.append(network(model.output, x))
-    fade = 1 / (1 + np.exp(-model.fade.numpy()))
     start = (x0.numpy() - mean[:4]) / std[:4]
-    path = [y[k] + fade**k * (start - y[0]) for k in range(6)]
+    path = [start, *faded(model, start, y)]
     t = STEP * torch.arange(6).double()
     found = model.predict(x0, t, Signal(t, u))
     assert_near(found, torch.from_numpy(mean[:4] + std[:4] * np.array(path)), 1e-7)
+
+
+def test_weights_of_a_force_without_changes_of_the_inputs_are_refused():
+    model = oscillators()
+    weights = model.state_dict()
+    weights["force.first.weight"] = weights["force.first.weight"][:, :2]
+    with pytest.raises(ValueError, match="without the change of the inputs"):
+        model.load_state_dict(weights)
 
 
 def test_a_step_follows_the_equation_of_motion():
@@ -105,7 +113,7 @@ def test_energy_never_rises_under_a_constant_input(spread, output):
         z, v = path.split(N, dim=-1)
         x = z @ W.T + b
         log_cosh = x.abs() + torch.log1p(torch.exp(-2 * x.abs())) - math.log(2)
-        force = model.force(torch.ones(2).double())
+        force = model.step_force(torch.ones(4).double())
         energy = (z @ K * z).sum(-1) / 2 + log_cosh.sum(-1) + v.square().sum(-1) / 2 - z @ force
         assert energy.diff(dim=0).max() <= 1e-9 * energy.abs().max()
         assert (energy[-1] < energy[0]).all()
@@ -128,8 +136,7 @@ def test_rollouts_are_bounded_for_any_parameters(spread):
         u = 5 * torch.randn(3, 2001, 4, generator=torch.manual_seed(seed)).double()
         ends = u[:, :-1].movedim(0, 1)
         far = 1e3 * torch.randn(3, 2 * N, generator=torch.manual_seed(seed)).double()
-        start, end = ends.chunk(2, dim=-1)
-        force = (model.force(start) + model.force(end)).norm(dim=-1).max() / 2
+        force = model.step_force(ends).norm(dim=-1).max()
         largest = force + torch.linalg.matrix_norm(model.coupling, 2) * N**0.5
         step = torch.linalg.matrix_norm(root @ B, 2) * largest
         path = torch.stack(model.latent_path(far, ends)) @ root.T
@@ -143,14 +150,14 @@ def test_modes_are_those_of_a_difference_quotient_of_a_step(spread, output):
     """Eigenvalues and vectors by NumPy, at the state where a long rollout comes to rest."""
     model = oscillators(3, spread, output=output)
     u = torch.tensor([0.3, -0.2]).double()
-    memory = torch.zeros(2 * N + 4).double()
+    memory = torch.zeros(model.memory_size).double()
     for _ in range(3000):
         memory, *_ = model.next_state(memory, u, u)
     rest = memory[: 2 * N]
     assert_near(model.equilibrium(model.latent_force(u)), rest[:N], 1e-7)
 
     def step(x):
-        later, q, _ = model.next_state(torch.cat([x, torch.zeros(4).double()]), u, u)
+        later, q, _ = model.next_state(torch.cat([x, torch.zeros(16).double()]), u, u)
         return later[: 2 * N].numpy(), q.numpy()
 
     size = 1e-5

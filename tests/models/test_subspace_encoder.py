@@ -27,6 +27,15 @@ def network(part, x):
     return linear + h
 
 
+def faded(model, start, outputs):
+    """States y_1, ... from the outputs at z_0, z_1, ... and the offset of the start."""
+    fade, share = 1 / (1 + np.exp(-model.fade.numpy())), np.exp(10 * model.share.numpy())
+    share = share / share.sum(axis=-1, keepdims=True)
+    offset = start - outputs[0]
+    kept = [(share * fade**k).sum(axis=-1) for k in range(1, len(outputs))]
+    return [y + k * offset for y, k in zip(outputs[1:], kept, strict=True)]
+
+
 def by_hand(model, q, v, u, k, steps):
     """States from sample k on, of a motion with samples a step apart."""
     s = make_statistics(2, 2)
@@ -35,12 +44,11 @@ def by_hand(model, q, v, u, k, steps):
     past = [*zq[k - 3 : k][::-1].flat, *zu[k - 3 : k + 1][::-1].flat]
     z = network(model.encoder, np.array([*zq[k], *(v[k] / v_std), *past]))
     start = np.concatenate([zq[k], v[k] / v_std])
-    path, fade = [], 1 / (1 + np.exp(-model.fade.numpy()))
-    offset = start - network(model.output, z)
+    outputs = [network(model.output, z)]
     for j in range(steps):
         z = z + network(model.transition, np.concatenate([z, zu[k + j], zu[k + j + 1]]))
-        path.append(network(model.output, z) + fade ** (j + 1) * offset)
-    y = np.array([start, *path])
+        outputs.append(network(model.output, z))
+    y = np.array([start, *faded(model, start, outputs)])
     return np.hstack([s.q_mean.numpy() + q_std * y[:, :2], v_std * y[:, 2:]])
 
 
@@ -105,6 +113,19 @@ def test_without_a_past_the_robot_was_at_rest(model):
 def test_the_history_has_all_steps_that_fit():
     statistics = dataclasses.replace(make_statistics(2, 2), step=0.1)
     assert SubspaceEncoder(statistics, history=0.3).past_steps == 3  # 0.3 / 0.1 is below 3
+
+
+def test_weights_with_one_time_constant_are_loaded(model):
+    weights = model.state_dict()
+    fade = torch.linspace(-1, 3, 4).double()
+    del weights["share"]
+    model.load_state_dict({**weights, "fade": fade})
+    x0, u = torch.randn(4).double(), motion(5, seed=1).u
+    path = model.increments(x0, T, Signal(T, u))
+    with torch.no_grad():
+        model.share.copy_(torch.randn(4, 4))  # the shares of equal terms do not matter
+    assert_near(model.increments(x0, T, Signal(T, u)), path, 1e-12)
+    assert torch.equal(torch.sigmoid(model.fade), torch.sigmoid(fade)[:, None].expand(4, 4))
 
 
 def test_steps_with_a_memory_repeat_a_rollout(model):

@@ -1,13 +1,5 @@
 """Logs of robots: readers, columns, units, cleaning steps, checks and the data source."""
 
-from pinn_dyn.data.logs.check.delay import DelayCurve, clear_delays, input_delays
-from pinn_dyn.data.logs.check.runs import (
-    INERTIA,
-    RESIDUAL,
-    Equation,
-    check_runs,
-    equations_of_motion,
-)
 from pinn_dyn.data.logs.clock import Deduplicate, InputDelay, Resample, SplitGaps
 from pinn_dyn.data.logs.columns import UNITS, Columns
 from pinn_dyn.data.logs.errors import LogError
@@ -35,17 +27,13 @@ from pinn_dyn.data.logs.step import Step, window_samples
 from pinn_dyn.data.logs.table import Request, Table
 
 __all__ = [
-    "INERTIA",
     "READERS",
-    "RESIDUAL",
     "UNITS",
     "Butterworth",
     "Cleaned",
     "Clock",
     "Columns",
     "Deduplicate",
-    "DelayCurve",
-    "Equation",
     "InputDelay",
     "InputRates",
     "InterpolateHeld",
@@ -65,9 +53,5 @@ __all__ = [
     "Step",
     "SubtractStart",
     "Table",
-    "check_runs",
-    "clear_delays",
-    "equations_of_motion",
-    "input_delays",
     "window_samples",
 ]

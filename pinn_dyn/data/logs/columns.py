@@ -138,7 +138,9 @@ class Columns:
 
     def to_si(self, raw: np.ndarray) -> np.ndarray:
         """Convert raw columns ``(T, K)`` to SI units."""
-        return (raw - self.offset) * self.factors
+        if any(self.offset):
+            raw = raw - self.offset
+        return raw if (self.factors == 1).all() else raw * self.factors
 
     def from_si(self, values: np.ndarray) -> np.ndarray:
         """Convert columns ``(T, K)`` in SI units to the units of the file."""

@@ -55,7 +55,8 @@ def joined(
     Raises:
         LogError: if no table has a column, or the names do not tell the runs apart.
     """
-    tables = {stem: _prefixed(table, stem, columns) for stem, table in tables.items()}
+    known = [*columns, *clock.columns]
+    tables = {stem: _prefixed(table, stem, known) for stem, table in tables.items()}
     parts = {name: tuple(x for x in columns if x in table) for name, table in tables.items()}
     if len(tables) == 1 or any(len(part) == len(columns) for part in parts.values()):
         return dict(tables)
@@ -98,9 +99,15 @@ def _prefixed(table: Table, stem: str, columns: Sequence[str]) -> Table:
 
 def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Table:
     """Join the rows of tables with the same stamps, otherwise those of all clocks, with gaps."""
+    shortest = min(map(len, tables))
+    if 0 < max(map(len, tables)) - shortest <= 1 and not all(
+        x in table for table in tables for x in clock.columns
+    ):
+        text = "the last row is left out: some files are a row shorter"
+        tables = [replace(x.select(np.arange(shortest)), notes=[*x.notes, text]) for x in tables]
     first, *further = tables
     name = " + ".join([first.name, *(Path(x.name).name for x in further)])
-    notes = [note for table in tables for note in table.notes]
+    notes = list(dict.fromkeys(note for table in tables for note in table.notes))
     clocks = [all(x in table for x in clock.columns) for table in tables]
     origin = tables[clocks.index(True)] if any(clocks) else first
     pairs = zip(tables, clocks, strict=True)

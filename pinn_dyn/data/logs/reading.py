@@ -58,9 +58,11 @@ class Layout:
         notes = pd.Series({x: list(table.notes) for x, table in tables.items()}).explode().dropna()
         for note, stems in notes.groupby(notes, sort=False):
             report.warn("rows", f"{listed(stems.index)}: {note}")
-        for stem, table in tables.items():
+        several = len(tables) > 1
+        for stem in list(tables):
+            table = tables.pop(stem)  # its memory is that of all numbers
             runs = table.runs(self.trajectory, stem)
-            if self.trajectory is not None and len(tables) > 1:
+            if self.trajectory is not None and several:
                 runs = {f"{stem}:{run}": rows for run, rows in runs.items()}
             recordings += [item for _, item in self.recordings(table, runs, report)]
         return recordings
@@ -115,7 +117,10 @@ class Layout:
             pieces = np.split(np.arange(len(rows)), starts)
             for k, piece in enumerate(pieces):
                 name = f"{run}:{k + 1}" if len(pieces) > 1 else run
-                part = {signal: x[rows[piece]] for signal, x in values.items()}
+                chosen: np.ndarray | slice = rows[piece]
+                if len(piece) == len(table) and (np.diff(rows[piece]) == 1).all():
+                    chosen = slice(None)  # no copy of a whole table
+                part = {signal: x[chosen] for signal, x in values.items()}
                 item = Recording(name, t[piece], part["q"], part.get("v"), part["u"])
                 read, item = self._checked(item, table, rows[piece], report)
                 text = f"{len(item)} rows, {item.duration:.6g} s, from {Path(table.name).name}"

@@ -15,6 +15,7 @@ from pinn_dyn.data.logs.measurement import Measurement
 SIGNALS: tuple[Literal["q", "v", "u"], ...] = ("q", "v", "u")
 _ROUND = (1, 2, 2.5, 4, 5, 8, 10)  # rates of which usual pieces are a multiple
 _LONGEST_GAP = 10  # sample times that are interpolated
+_GAP_BURSTS, _MANY = 3, 5000  # usual bursts in a gap; rows of which one in a thousand is a burst
 _CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
 
 
@@ -25,8 +26,7 @@ def clock_steps(t: np.ndarray) -> str:
     """
     spacing = np.diff(t)
     usual = float(np.median(spacing[spacing > 0]))
-    decade = 10 ** np.floor(-np.log10(usual))
-    rate = min((decade * x for x in _ROUND), key=lambda x: abs(np.log(x * usual)))
+    rate = round_rate(usual)
     digit = 10 ** (np.floor(np.log10(_LONGEST_GAP * usual)) - 1)
     gap = digit * np.ceil(_LONGEST_GAP * usual / digit)
     gap, rate = float(f"{gap:.3g}"), float(f"{rate:.6g}")
@@ -36,6 +36,35 @@ def clock_steps(t: np.ndarray) -> str:
         wording.line("resample", wording.step("Resample", rate=rate, max_gap=gap)),
     ]
     return f"\n\n{wording.steps(lines)}"
+
+
+def burst_steps(t: np.ndarray) -> list[str]:
+    """Return lines with the steps that repair stamps in bursts, ``(T,)`` in s.
+
+    The rate is that of the rows between gaps, which are longer than usual bursts; it is round if
+    the stamps allow it.
+    """
+    spacing = np.diff(t)
+    burst = float(np.quantile(spacing, 0.999 if len(t) > _MANY else 0.95))
+    inside = (spacing >= 0) & (spacing <= _GAP_BURSTS * burst)
+    written = np.cumsum(np.where(inside, spacing, burst))
+    rows = np.arange(len(written))
+    rate = 1 / float(np.polyfit(rows, written, 1)[0])
+    rounded = float(f"{rate:.3g}")
+    distance = written - rows / rounded
+    rate = rounded if np.ptp(distance) < 3 * burst else rate
+    step = wording.step("RowClock", rate=float(f"{rate:.7g}"), longest=float(f"{2 * burst:.2g}"))
+    lines = [wording.line("row_clock", step)]
+    if not inside.all():
+        longest = float(f"{_GAP_BURSTS * burst:.2g}")
+        lines.insert(0, wording.line("split_gaps", wording.step("SplitGaps", longest=longest)))
+    return lines
+
+
+def round_rate(sample_time: float) -> float:
+    """Return a round rate in Hz near that of a sample time, s."""
+    decade = 10 ** np.floor(-np.log10(sample_time))
+    return min((float(decade * x) for x in _ROUND), key=lambda x: abs(np.log(x * sample_time)))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from pinn_dyn.data.logs.check import plausibility
 from pinn_dyn.data.logs.check.repeats import check_repeats
-from pinn_dyn.data.logs.check.runs import check_runs, equations_of_motion
 from pinn_dyn.data.logs.cleaning import clean, long_enough
 from pinn_dyn.data.logs.clock import InputDelay
 from pinn_dyn.data.logs.columns import UNITS, Columns, validated
@@ -223,7 +222,10 @@ class LogSource(DataSource):
             self.validation, self.test, self.guard = default_split(
                 times, self.seed, float(self.input_delay.max(initial=0.0))
             )
-        parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
+        lead = float(np.max(self.delay))
+        parts = split(
+            recordings, self.validation, self.test, guard=self.guard, seed=self.seed, lead=lead
+        )
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
         pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
         limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
@@ -236,12 +238,10 @@ class LogSource(DataSource):
         training = stretches["train"]
         everything = [item for items in stretches.values() for item in items]
         step = one_sample_time(everything)
-        measurements += plausibility.check_angles(everything, self.q, step)
         if self.v is not None:
             measurements += plausibility.check_velocities(everything, self.q, self.v, step)
-            measurements += plausibility.check_velocity_lag(everything, self.q, self.v, step)
-        motion = equations_of_motion(everything, self.q, self.u, step)
-        measurements += check_runs(everything, self.q, self.u, *motion)
+            raws = [part.raw for part in cleaned if len(part.raw) > 1]
+            measurements += plausibility.check_lost_rows(raws, self.q)
         measurements += plausibility.check_inputs(training, self.q, self.u)
         measurements += plausibility.check_rest(stretches, self.q)
         report.add("Splits", "train", summary(training, step))

@@ -75,9 +75,17 @@ def default_split(
 
 
 def split(
-    recordings: list[Recording], validation: Part, test: Part, *, guard: float, seed: int
+    recordings: list[Recording],
+    validation: Part,
+    test: Part,
+    *,
+    guard: float,
+    seed: int,
+    lead: float = 0.0,
 ) -> dict[str, list[Recording]]:
     """Assign whole runs, and cut the other runs into training, guard, validation, guard, test.
+
+    Validation and test that are cut begin ``lead`` s earlier, which a shift of the inputs drops.
 
     Raises:
         LogError: on unknown or doubly used runs, or too few or too short ones.
@@ -108,13 +116,13 @@ def split(
         if recording.run in splits:
             parts[splits[recording.run]].append(recording)
         else:
-            for name, stretch in _cut(recording, validation, test, guard):
+            for name, stretch in _cut(recording, validation, test, guard, lead):
                 parts[name].append(stretch)
     return parts
 
 
 def _cut(
-    recording: Recording, validation: Part, test: Part, guard: float
+    recording: Recording, validation: Part, test: Part, guard: float, lead: float
 ) -> list[tuple[str, Recording]]:
     t, stretches = recording.t, []
     end, last = t[-1], len(t)
@@ -123,12 +131,13 @@ def _cut(
         if seconds is None:
             continue
         # From the row at or before the border, so that the stretch is not a row too short.
-        first = int(np.searchsorted(t, end - seconds, side="right")) - 1
+        first = int(np.searchsorted(t, end - seconds - lead, side="right")) - 1
         border = end - seconds - guard
         if border <= t[0]:
             raise LogError(f"{recording.place}: too short to keep {seconds} s for {name}")
-        stretches.append((name, recording.rows(slice(first, last))))
-        end, last = border, min(int(np.searchsorted(t, border, side="right")) + 1, first)
+        stretches.append((name, recording.rows(slice(max(first, 0), last))))
+        before = int(np.searchsorted(t, end - seconds, side="right")) - 1
+        end, last = border, min(int(np.searchsorted(t, border, side="right")) + 1, before)
     # The row after the border only completes a stretch that is measured from its end.
     train = recording.rows(slice(0, max(last - 1, 1))) if stretches else recording
     return [*stretches, ("train", train)]

@@ -106,8 +106,10 @@ class Table:
 
     def numbers(self, columns: Sequence[str], signal: str) -> np.ndarray:
         """Return columns as finite numbers, ``(T, K)``, NaN for empty cells."""
-        values = [self._numbers(name, signal) for name in columns]
-        return np.reshape(values, (len(columns), len(self))).T
+        values = np.empty((len(self), len(columns)))
+        for k, name in enumerate(columns):
+            values[:, k] = self._numbers(name, signal)
+        return values
 
     def _numbers(self, name: str, signal: str) -> np.ndarray:
         raw = self.column(name, signal)

@@ -12,11 +12,12 @@ from pinn_dyn import wording
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import TRAJECTORY, LogError
 from pinn_dyn.data.logs.measurement import Measurement, judged
-from pinn_dyn.data.logs.recording import clock_steps
+from pinn_dyn.data.logs.recording import burst_steps, clock_steps
 from pinn_dyn.data.logs.registers import check_registers
 from pinn_dyn.data.logs.stamps import SAMPLE_TIMES, Clock
 from pinn_dyn.data.logs.table import Table, alternates
 
+_BURST_TEXT = "its stamps come in bursts: take the times from the rows by RowClock"
 _GAP_FACTOR = 3.0  # sample times from which a distance between rows is a gap
 _BURSTS = 0.4  # share of rows right after the row before from which stamps come in bursts
 # A row is a jump if its distance from its neighbors exceeds this multiple of the usual distance.
@@ -79,13 +80,13 @@ def check_clock(
     if same.any():  # a logger that is faster than its source repeats whole rows
         same[same] = table.frame.duplicated().to_numpy()[1:][same]
     bursts = _burst_share(t[np.r_[True, ~same]])
-    options = f"rate: <of the rows, Hz>, longest: {2 * spacing.max():.2g}"
-    text = f"its stamps come in bursts: use pinn_dyn.data.logs.RowClock ({options})"
-    row_clock = f"{text}, or " if bursts > _BURSTS else ""
     steps = f"as in{clock_steps(t)}"
     split = f"name the column that tells runs apart in {TRAJECTORY}"
-    once = f"{row_clock}add a Deduplicate step, which keeps the first row, {steps}"
-    fill = f"{row_clock}split long gaps and interpolate over short ones, {steps}"
+    once = f"add a Deduplicate step, which keeps the first row, {steps}"
+    fill = f"split long gaps and interpolate over short ones, {steps}"
+    in_bursts = bursts > _BURSTS
+    if in_bursts:
+        once = fill = f"{_BURST_TEXT}, as in\n\n{wording.steps(burst_steps(t))}"
     for fault, rows, problem, cure in (
         ("backward times", spacing < 0, "goes back", split),
         ("repeated times", spacing == 0, "repeats", once),
@@ -98,9 +99,9 @@ def check_clock(
                 f"{t[k + 1]:.9g} s ({int(rows.sum())} such rows, {typical:.6g} s is usual): "
                 f"{cure}"
             )
-    bad = bool(row_clock) and "bursts" not in repairs
+    bad = in_bursts and "bursts" not in repairs
     expected = f"below {_BURSTS}"
-    text = f"{table.name}: {text}"
+    text = f"{table.name}: {_BURST_TEXT}, first of the steps: {' '.join(burst_steps(t))}"
     return [judged("share of rows in bursts", table.name, bursts, expected, bad, text)]
 
 

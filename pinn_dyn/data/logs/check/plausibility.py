@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import scipy
 
 from pinn_dyn import wording
-from pinn_dyn.data.logs.check.averages import Averages
-from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression
+from pinn_dyn.data.logs.check.holds import held_rows
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
 
+LOST = "share of steps over lost rows"
+"""Name of the measurement of rows that a clock of row numbers does not miss."""
 _FACTORS = (0.8, 1.25)  # range of dq/dt over v without a warning
 _CLEAR = 0.8  # correlation from which the factor is determined
 _AT_REST, _ALL_AT_REST = 0.9, 0.98  # shares of samples at rest of a warning and of a stop
 _STILL = 1e-12  # range of a coordinate that does not move, m or rad
 _TENTHS, _MOST_ODD = 10, 0.6  # parts of a stretch; largest share of parts that disagree
-_PERIODIC = 0.6  # of the acceleration: largest share that periodic terms leave
-_FREE = 0.03  # largest share of the acceleration of a free motor that its input leaves
-_NEXT = 0.02  # median steps of q between an input and the next q
-_LAGS, _LAGGED = 0.2, 0.5  # of v: longest, s; share over that without a lag
+_COPY, _ROWS_LATER = 0.02, 3  # median steps between an input and a state; rows
+_LOST, _SURE = 1.6, 0.15  # sample times that pass from row to row; largest deviation of their noise
+_OFTEN = 3.0  # rows that lack a row before them over rows that come too early
 _MOVING, _LEFT = 0.05, 0.7  # of a tenth: share of the mean square, share of Δq² that k v leaves
 
 
@@ -36,60 +36,43 @@ def check_inputs(training: list[Recording], q: Columns, u: Columns) -> list[Meas
         judged("range of the input", name, size, "above 0", size == 0, text.format(name))
         for name, size in zip(u.columns, ranges, strict=True)
     ]
-    steps = np.vstack([np.diff(item.q, axis=0) for item in training])
-    usual = np.median(np.abs(steps), axis=0).clip(min=1e-300)
     for i, name in enumerate(u.columns):
-        following = np.vstack([item.u[:-1, [i]] - item.q[1:] for item in training])
-        distance = np.median(np.abs(following), axis=0) / usual
-        k = int(distance.argmin())
+        distance, state = _nearest_state(training, q, i)
         text = (
-            f"input {name!r} is {q.columns[k]!r} of the next row, not a command: any model "
-            "predicts q from it, and no controller can use it; log the command that is sent"
+            f"input {name!r} is {state}, not a command: any model predicts q from it, and no "
+            "controller can use it; log the command that is sent"
         )
-        bad = bool(distance[k] < _NEXT)
-        measured = ("distance of the input from the next q", name, distance[k])
-        results.append(judged(*measured, f"above {_NEXT:g} steps", bad, text, "stop"))
+        bad = distance < _COPY
+        measured = ("distance of the input from a measured state", name, distance)
+        results.append(judged(*measured, f"above {_COPY:g} steps", bad, text, "stop"))
     return results
 
 
-def check_angles(recordings: list[Recording], q: Columns, step: float) -> list[Measurement]:
-    """Measure the largest angles; an angle beyond 4 pi rad is probably in degrees."""
-    results = []
-    for k in (k for k, unit in enumerate(q.units) if unit == "rad"):
-        angle, run = max((float(np.abs(item.q[:, k]).max()), item.run) for item in recordings)
-        text = (
-            f"{run}, column {q.columns[k]!r}: an angle of {angle:.4g} rad is more than two turns: "
-            f"is it in degrees? Its unit is configured as {q.unit[k]!r}"
-        )
-        bad = angle > 4 * math.pi and not _turns(recordings, k, step)
-        results.append(judged("largest angle [rad]", q.columns[k], angle, "below 4 pi", bad, text))
-    return results
+def _nearest_state(training: list[Recording], q: Columns, i: int) -> tuple[float, str]:
+    """Return the distance of input i from the nearest column of q or v, and the name of this state.
 
-
-def _turns(recordings: list[Recording], k: int, step: float) -> bool:
-    """Tell whether angle k grows up to the end, or its acceleration has the period of a turn.
-
-    A free motor, whose acceleration follows from its input and its friction, may turn, too.
+    The distance is the median one to a line a + b x of the state x, in the same row or up to three
+    rows later, over the median step of the input.
     """
-    steps = [np.diff(item.q[:: max(1, len(item) // 50), k]) for item in recordings]
-    path, last = sum(np.abs(x).sum() for x in steps), sum(abs(x[-1]) * len(x) for x in steps)
-    if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
-        return True
-    data = Averages.of(recordings, step)
-    if data is None:
-        return False
-    columns = {
-        "a": data.a[:, k],
-        "plain": np.hstack([np.ones((len(data.t), 1)), data.v]),
-        "periodic": np.hstack([np.sin(data.q), np.cos(data.q)]),
-        "drives": np.hstack([data.u[:, 0], np.sign(data.v)]),
-    }
-    regression = EquationOfMotionRegression(columns, np.zeros(len(data.t), dtype=int))
-    plain, periodic, driven = (
-        float(regression.fit("a", x).shares()[0, 0])
-        for x in (["plain"], ["plain", "periodic"], ["plain", "drives"])
-    )
-    return periodic < _PERIODIC * plain or driven < _FREE
+    moving = [item for item in training if len(item) > 2 * _ROWS_LATER]
+    u = np.concatenate([item.u[:-_ROWS_LATER, i] for item in moving] or [np.zeros(1)])
+    steps = np.abs(np.concatenate([np.diff(item.u[:, i]) for item in training]))
+    if not steps.any():
+        return np.inf, ""
+    usual = np.median(steps[steps > 0])
+    best = np.inf, ""
+    for signal in ("q", "v") if training[0].v is not None else ("q",):
+        for k, lag in itertools.product(range(len(q.columns)), range(_ROWS_LATER + 1)):
+            parts = [getattr(x, signal)[lag : len(x) - _ROWS_LATER + lag, k] for x in moving]
+            state = np.concatenate(parts or [np.zeros(1)])
+            slope = ((state - state.mean()) * (u - u.mean())).mean() / max(state.var(), 1e-300)
+            left = u - u.mean() - slope * (state - state.mean())
+            distance = float(np.median(np.abs(left)) / usual)
+            if distance < best[0]:
+                row = ("the same row", "the next row", f"{lag} rows later")[min(lag, 2)]
+                name = f"{q.columns[k]!r}" if signal == "q" else f"the speed of {q.columns[k]!r}"
+                best = distance, f"{name} of {row}" if lag < 2 else f"{name}, {row}"
+    return best
 
 
 def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measurement]:
@@ -103,8 +86,9 @@ def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measur
         text = f"column {name!r} (q): moves no more than its noise, {spread:.3g} {q.units[k]}"
         measured = ("spread of q in the training", name, spread, "above noise")
         results.append(judged(*measured, not moves(training, k), text))
+    rows = max(held_rows(item.q) for item in training)  # held values do not move row by row
     steps = {
-        name: np.vstack([np.abs(np.diff(item.q, axis=0)) for item in items])
+        name: np.vstack([np.abs(item.q[rows:] - item.q[:-rows]) for item in items])
         for name, items in splits.items()
     }
     slow = 0.01 * steps["train"].max(axis=0).clip(min=1e-300)
@@ -177,33 +161,35 @@ def check_velocities(
     return results
 
 
-def check_velocity_lag(
-    recordings: Sequence[Recording], q: Columns, v: Columns, step: float
-) -> list[Measurement]:
-    """Measure the lag of v behind dq/dt, as that of a filter or of another clock."""
-    parts = [replace(item, u=item.v) for item in recordings if item.v is not None]
-    last = max(2, min(round(_LAGS / step), min(map(len, parts)) // 4))
-    lags = np.unique(np.linspace(-last, last, 2 * min(last, 20) + 1).round().astype(int))
-    data = Averages.of(parts, step, lags=lags)
-    if data is None:
-        return []
-    results = []
-    for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
-        columns = {"v": data.u[:, :, k], "slope": data.v[:, k], "one": np.ones(len(data.t))}
-        regression = EquationOfMotionRegression(columns, np.zeros(len(data.t), dtype=int))
-        shares = regression.fit("v", ["slope", "one"]).shares()[0]
-        best = int(shares.argmin())
-        # Lag l of a column means that it is read l samples earlier: a late v needs a negative one.
-        lag = -lags[best] * step
-        clear = shares[best] < min(_LAGGED * shares[lags == 0][0], 1 - _CLEAR**2)
-        bad = bool(clear and abs(lag) > 1.5 * step)
-        text = (
-            f"column {b!r} is {1e3 * abs(lag):.3g} ms {'behind' if lag > 0 else 'ahead of'} the "
-            f"derivative of {a!r}: is it filtered or from another clock? Leave out v (it is then "
-            "computed from q), or correct its times"
-        )
-        results.append(judged("lag of v [ms]", f"{a}, {b}", 1e3 * lag, "0", bad, text))
-    return results
+def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measurement]:
+    """Measure the share of rows before which rows are missing, by Δq = v Δt in single steps.
+
+    A clock of row numbers does not see them. The time that passes from row to row is that of all
+    joints together, Δt = Σ v_j Δq_j / σ_j² / Σ v_j² / σ_j².
+    """
+    passed = []
+    for item in recordings:
+        assert item.v is not None
+        step = np.diff(item.t)[:, None]
+        dq, expected = np.diff(item.q, axis=0), step * (item.v[1:] + item.v[:-1]) / 2
+        noise = 1.4826 * np.median(np.abs(dq - expected), axis=0)
+        noise = np.maximum(noise, 0.02 * np.sqrt((expected**2).mean(axis=0))).clip(min=1e-150)
+        weight = ((expected / noise) ** 2).sum(axis=1)
+        sure = weight > 1 / _SURE**2
+        passed.append((dq * expected / noise**2).sum(axis=1)[sure] / weight[sure])
+    times = np.concatenate(passed)
+    late = times > _LOST
+    whole = np.abs(times - times.round())[late] < 0.25
+    lost, early = int(late.sum()), int((times < 2 - _LOST).sum())
+    bad = lost >= 5 and lost > _OFTEN * early and whole.mean() > 0.8
+    share = lost / max(len(times), 1)
+    text = (
+        f"in {100 * share:.2g} % of the steps q moves as far as v does in two or more sample "
+        "times: rows are lost, and the clock counts the rows that are left; log the times of the "
+        "samples"
+    )
+    place = ", ".join(q.columns)
+    return [judged(LOST, place, share, "0", bool(bad), text)]
 
 
 def moves(recordings: Sequence[Recording], k: int) -> bool:

@@ -114,14 +114,39 @@ def read_json(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     text = path.read_text(encoding="utf-8-sig")
     lines = text.splitlines() if path.suffix.lower() == ".jsonl" else []
     content = [json.loads(line) for line in lines if line.strip()] or json.loads(text)
-    frame = pd.json_normalize(content)
-    if isinstance(content, Mapping) or isinstance(frame.get(request.time, [None])[0], list):
+    prefix, records = _records(content, request.columns)
+    frame = pd.json_normalize(records)
+    if not isinstance(records, list) or isinstance(frame.get(request.time, [None])[0], list):
         return _of_runs(path, request, content)
     columns: dict[str, pd.Series] = {}
+    notes = []
     for name, cells in frame.items():
+        key = f"{prefix}{name}"
         is_vector = any(isinstance(x, list) for x in cells)
-        columns |= vector_columns(str(name), cells) if is_vector else {str(name): cells}
-    return {"": pd.DataFrame(columns).set_axis(frame.index + 1)}
+        columns |= vector_columns(key, cells) if is_vector else {key: cells}
+        used = any(x.startswith(key) for x in request.columns)
+        lengths = {len(x) for x in cells if isinstance(x, list)}
+        if used and len(lengths) > 1:
+            notes.append(f"{key!r} has {min(lengths)} to {max(lengths)} entries: others are empty")
+        if used and (count := int(cells.isna().sum())) > 0:
+            notes.append(f"{count} of {len(cells)} records have no {key!r}")
+    table = pd.DataFrame(columns).set_axis(frame.index + 1)
+    table.attrs["notes"] = notes
+    return {"": table}
+
+
+def _records(content: Any, columns: Collection[str], prefix: str = "") -> tuple[str, Any]:
+    """Return the list of records that holds the columns, below keys of mappings, and its prefix."""
+    if not isinstance(content, Mapping):
+        return prefix, content
+    for key, value in content.items():
+        path = f"{prefix}{key}."
+        if any(x.startswith(path) for x in columns):
+            if isinstance(value, list) and value and isinstance(value[0], Mapping):
+                return path, value
+            if isinstance(value, Mapping):
+                return _records(value, columns, path)
+    return prefix, content
 
 
 def _of_runs(path: Path, request: Request, content: Any) -> dict[str, pd.DataFrame]:

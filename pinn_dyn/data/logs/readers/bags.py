@@ -23,6 +23,7 @@ from pinn_dyn.data.logs.table import Request, Table, alternates
 # Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
 _NAMES = ("name", "joint_names", "interface_names")
 _LATEST = 1.0  # s; a message that is later than this begins a new run
+_REGULAR = 0.05  # share of messages that come early, of one publisher
 _FEW = 20  # messages from which two publishers can be told
 _RECEIVED = ""  # column of the times of receipt
 
@@ -32,7 +33,7 @@ def read_bag(path: Path, request: Request) -> Table:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
-    description = [6, str(path.absolute()), stats, fields, request.max_age]
+    description = [7, str(path.absolute()), stats, fields, request.max_age]
 
     def decode() -> dict[str, np.ndarray]:
         notes: list[str] = []
@@ -125,11 +126,12 @@ def _topic(
         if field.isdigit() and len(joined) > 1:
             turns = f"is of {listed(joined)} by turns"
             raise LogError(f"{path}: {column!r} {turns}: write {column[: -len(field)]}{joined[0]}")
+    publishers, orders = _publishers(publishers, joints, times)
     usual = pd.Series(publishers[~foreign]).mode()[0]
     for reason, mask in (
         ("with stamp 0", zero),
         (f"of {listed(sorted(set().union(*joints[foreign])))}", foreign),
-        ("of another publisher", ~foreign & (publishers != usual)),
+        (f"of another publisher{orders}", ~foreign & (publishers != usual)),
     ):
         if mask.any():
             notes.append(f"{mask.sum()} of {len(rows)} messages of {topic} {reason} are dropped")
@@ -143,6 +145,32 @@ def _topic(
                 f"{topic}, and the bag does not record which. Stop or remap one, and record again"
             )
     return frame
+
+
+def _publishers(
+    publishers: np.ndarray, joints: np.ndarray, times: np.ndarray
+) -> tuple[np.ndarray, str]:
+    """Return numbers of the publishers of messages, and the orders of joints that tell them apart.
+
+    Nodes that share a connection are told apart by the order of the joints, if the messages of one
+    order come at regular times, and those of all do not.
+    """
+    orders = list(dict.fromkeys(x for x in joints if x))
+    numbers = np.array([orders.index(x) if x else 0 for x in joints])
+    counts = np.bincount(numbers)
+    if len({frozenset(x) for x in orders}) != 1 or len(orders) < 2 or counts.min() < _FEW:
+        return publishers, ""
+    irregular = [_early(times[mask]) for mask in (numbers >= 0, numbers == counts.argmax())]
+    if irregular[0] < _REGULAR or irregular[1] > _REGULAR:
+        return publishers, ""
+    texts = [f"{count} of {', '.join(x)}" for x, count in zip(orders, counts, strict=True)]
+    return publishers * len(orders) + numbers, f" ({' and '.join(texts)})"
+
+
+def _early(times: np.ndarray) -> float:
+    """Return the share of messages that follow within half of the usual time."""
+    spacing = np.diff(np.sort(times))
+    return float((spacing < np.median(spacing) / 2).mean())
 
 
 def _merged(topics: Sequence[pd.DataFrame], last: str) -> pd.DataFrame:

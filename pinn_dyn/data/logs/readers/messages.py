@@ -11,12 +11,14 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.table import optional
 
+_Item = TypeVar("_Item")
 Message = tuple[str, int, int, Any]
 """Topic, number of the publisher, time of receipt in ns, and decoded message."""
 
@@ -38,17 +40,54 @@ def open_bag(path: Path) -> AbstractContextManager[Bag]:
 def _rosbag(path: Path) -> Iterator[Bag]:
     common = _common_types(path)
     highlevel = optional("rosbags.highlevel", path)
-    with highlevel.AnyReader([path], default_typestore=common) as reader:
+    notes: list[str] = []
+    with (
+        _with_storage(path) as folder,
+        highlevel.AnyReader([folder], default_typestore=common) as reader,
+    ):
         _register(reader.typestore, common.fielddefs)
 
         def messages(topics: Sequence[str]) -> Iterator[Message]:
             connections = [item for item in reader.connections if item.topic in topics]
             for item in connections:
                 _check_type(path, reader.typestore, item.msgtype)
-            for item, received, raw in reader.messages(connections):
+            for item, received, raw in _up_to_damage(reader.messages(connections), notes):
                 yield item.topic, item.id, received, reader.deserialize(raw, item.msgtype)
 
-        yield Bag({item.topic: item.msgtype for item in reader.connections}, messages, [])
+        yield Bag({item.topic: item.msgtype for item in reader.connections}, messages, notes)
+
+
+@contextmanager
+def _with_storage(path: Path) -> Iterator[Path]:
+    """Yield the folder of a bag, or a copy of links whose metadata name the storage.
+
+    A recorder that was reindexed may leave its identifier empty.
+    """
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text() if metadata.is_file() else ""
+    empty = re.compile(r"""(storage_identifier:) *(""|'')? *$""", re.MULTILINE)
+    if not empty.search(text):
+        yield path
+        return
+    with TemporaryDirectory(prefix="pinn_dyn-") as folder:
+        for file in path.iterdir():
+            if file != metadata:
+                (Path(folder) / file.name).symlink_to(file.absolute())
+        kind = "mcap" if any(path.glob("*.mcap*")) else "sqlite3"
+        (Path(folder) / metadata.name).write_text(empty.sub(rf"\1 {kind}", text))
+        yield Path(folder)
+
+
+def _up_to_damage(messages: Iterator[_Item], notes: list[str]) -> Iterator[_Item]:
+    """Yield messages up to a damaged one, which is noted; the first one must be readable."""
+    try:
+        yield next(messages)
+    except StopIteration:
+        return
+    try:
+        yield from messages
+    except Exception:
+        notes[:] = ["the file is damaged or has no end, as after a crash: it is read up to there"]
 
 
 @contextmanager
@@ -61,16 +100,7 @@ def _mcap(path: Path) -> Iterator[Bag]:
             file.seek(0)
             reader = library.NonSeekingReader(file)
             messages = reader.iter_messages(topics, log_time_order=False)
-            try:
-                yield next(messages)
-            except StopIteration:
-                return
-            try:
-                yield from messages
-            except Exception:
-                notes[:] = [
-                    "the file is damaged or has no end, as after a crash: it is read up to there"
-                ]
+            yield from _up_to_damage(messages, notes)
 
         schemas = {channel.topic: schema for schema, channel, _ in stream(None)}
 

@@ -23,8 +23,11 @@ _LENGTHS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
 _AXES = ("X", "Y", "Z")
 
 
-def one_header(text: str, requested: Collection[str]) -> str:
+def one_header(text: str, requested: Collection[str]) -> tuple[str, float]:
     """Return a text file with one header, on the same lines; other files as they are.
+
+    The second result is the rate of the frames that Vicon and Qualisys state, Hz; 0 if there is
+    none.
 
     Args:
         text: the file.
@@ -32,10 +35,13 @@ def one_header(text: str, requested: Collection[str]) -> str:
     """
     start = text[:2000].lstrip()
     if start.startswith("Format Version"):
-        return _motive(text)
+        return _motive(text), 0.0
     if _SECTION.fullmatch(start.partition("\n")[0]):
         return _vicon(text, requested)
-    return _qualisys(text) if start.startswith("NO_OF_FRAMES") else text
+    if not start.startswith("NO_OF_FRAMES"):
+        return text, 0.0
+    stated = re.search(r"(?m)^FREQUENCY[,;\t ]+([\d.]+)", text)
+    return _qualisys(text), float(stated[1]) if stated else 0.0
 
 
 def _motive(text: str) -> str:
@@ -55,7 +61,7 @@ def _motive(text: str) -> str:
     return _with_header(lines, last - 1, last + 1, names, units, ",")
 
 
-def _vicon(text: str, requested: Collection[str]) -> str:
+def _vicon(text: str, requested: Collection[str]) -> tuple[str, float]:
     lines = text.split("\n")
     starts = [k for k, line in enumerate(lines) if _SECTION.fullmatch(line.strip())]
     best: tuple[int, int, list[str], str] = (-1, 0, [], ",")
@@ -71,7 +77,9 @@ def _vicon(text: str, requested: Collection[str]) -> str:
     _, start, names, separator = best
     end = next((k for k in starts if k > start), len(lines))
     units = _cells("".join(lines[start + 4 : start + 5]), separator)
-    return _with_header(lines[:end], start + 3, start + 5, names, units, separator)
+    stated = re.match(r"[\d.]+", "".join(lines[start + 1 : start + 2]).strip())
+    rate = float(stated[0]) if stated else 0.0
+    return _with_header(lines[:end], start + 3, start + 5, names, units, separator), rate
 
 
 def _qualisys(text: str) -> str:

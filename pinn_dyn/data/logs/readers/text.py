@@ -13,10 +13,11 @@ import io
 import re
 import warnings
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.columns import known_unit
@@ -25,6 +26,7 @@ from pinn_dyn.data.logs.readers.motion_capture import one_header
 from pinn_dyn.data.logs.table import Request, Table, vector_columns
 
 _SAMPLE = 300  # lines from which the dialect and the header are detected
+_BLOCK = 1 << 24  # bytes that are parsed at once
 _FOOTER = 20  # lines at the end that may be no rows
 _COMMENTS = ("#", "%", "//")
 _NO_VALUES = ["-", "--", "nan(ind)", "-nan(ind)"]  # beside those of pandas
@@ -34,6 +36,7 @@ _NUMBERS = {
     for mark in ".,"
 }
 _NUMBER = {mark: re.compile(text, re.ASCII | re.IGNORECASE) for mark, text in _NUMBERS.items()}
+_FRAME, _TIME = "Frame", "Time"  # columns of motion capture
 _ITEM = rf"(?:{_NUMBERS['.']}|nan)"
 _BRACKETS = rf"[\[({{]\s*{_ITEM}(?:[\s,;]+{_ITEM})*[\s,;]*[\])}}]"
 _BARE_BRACKETS = re.compile(rf"(?<![^\s,;]){_BRACKETS}", re.IGNORECASE)
@@ -73,11 +76,13 @@ def read_text(path: Path, request: Request) -> Table:
     Raises:
         LogError: if no line holds numbers, or rows are longer than the header.
     """
-    content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    text = _decoded(content).replace("\r\n", "\n").replace("\r", "\n")
-    text = one_header(text, request.columns)
-    if _BARE_BRACKETS.search(text, 0, 10_000):
-        text = _BARE_BRACKETS.sub(r'"\g<0>"', text)
+    blocks = _blocks(path)
+    text, rate = one_header(next(blocks, ""), request.columns)
+    if rate or text.startswith("\n"):  # the header of motion capture changes the lines
+        text, rate = one_header("".join([*_blocks(path)]), request.columns)
+        blocks = iter(())
+    brackets = bool(_BARE_BRACKETS.search(text, 0, 10_000))
+    text = _BARE_BRACKETS.sub(r'"\g<0>"', text) if brackets else text
     lines = text.split("\n", _SAMPLE)[:_SAMPLE]
     dialect = _dialect(lines, request.sep)
     if dialect is None:
@@ -90,30 +95,131 @@ def read_text(path: Path, request: Request) -> Table:
             f"{path}, line {start + 1}: {dialect.width} cells, but the header in line {header + 1} "
             f"has {len(names)} names: {listed(names)}"
         )
-    # The lines above are empty, as quotes in them may be unbalanced.
-    body = "\n" * start + text[sum(len(line) + 1 for line in lines[:start]) :]
-    body, notes = _repaired(body, lines[header] if header >= 0 else None, dialect)
-    with warnings.catch_warnings():
-        # pandas would cut rows that are longer than the header, and only warn.
-        warnings.simplefilter("error", pd.errors.ParserWarning)
-        frame = pd.read_csv(
-            io.BytesIO(body.encode()),
-            skiprows=start,
-            sep=r"\s+" if dialect.separator == " " else dialect.separator,
-            decimal=dialect.decimal,
-            header=None,
-            names=range(len(names)),
-            na_values=_NO_VALUES,
-            skipinitialspace=True,
-            skip_blank_lines=False,
-            low_memory=False,
-            index_col=False,
-        )
-    frame.index = pd.RangeIndex(start + 1, len(frame) + start + 1)
-    frame = _with_vectors(frame.dropna(how="all"), names)
+    body = _Body(dialect, names, lines[header] if header >= 0 else "", start)
+    following = next(blocks, "")
+    body.add(text[sum(len(line) + 1 for line in lines[:start]) :], last=not following)
+    while following:
+        text, following = following, next(blocks, "")
+        body.add(_BARE_BRACKETS.sub(r'"\g<0>"', text) if brackets else text, last=not following)
+    frame, notes = _with_vectors(body.frame(), names), body.all_notes()
+    if rate and _FRAME in frame:
+        frame, notes = _of_frames(frame, rate, notes)
     units = _units(lines[header + 1 : start], dialect, names)
     hint = "" if header >= 0 else ": it has no header, so its columns are numbered from 0."
     return Table(frame, str(path), "line", notes, units, hint)
+
+
+def _blocks(path: Path) -> Iterator[str]:
+    """Yield the text of a file in blocks of whole lines, which take little memory each."""
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        rest = file.read(_BLOCK)
+        if rest[:2] in (b"\xff\xfe", b"\xfe\xff") or rest[1:2] == b"\0":
+            rest += file.read()  # lines of UTF-16 have no simple end
+            yield _decoded(rest).replace("\r\n", "\n").replace("\r", "\n")
+            return
+        while rest:
+            block = file.read(_BLOCK)
+            end = rest.rfind(b"\n") + 1 if block else len(rest)
+            if end:
+                yield _decoded(rest[:end]).replace("\r\n", "\n").replace("\r", "\n")
+            rest = rest[end:] + block
+
+
+class _Body:
+    """Rows of a text file, parsed in blocks; only the numbers of each are kept."""
+
+    def __init__(self, dialect: _Dialect, names: Sequence[str], header: str, start: int):
+        self._dialect, self._width, self._header = dialect, len(names), header
+        self._lines = start
+        self._parts: list[dict[int, np.ndarray]] = []
+        self._rows: list[np.ndarray] = []
+        self._repeats = 0
+        self._notes: list[str] = []
+
+    def add(self, text: str, *, last: bool) -> None:
+        """Parse a block of lines."""
+        first = self._lines
+        if any(mark in text for mark in _COMMENTS):
+            text = re.sub(rf"(?m)^[ \t]*(?:{'|'.join(_COMMENTS)}).*$", "", text)
+        if self._header:
+            repeats = f"\n{self._header}\n"
+            text = f"\n{text}"
+            self._repeats += text.count(repeats)
+            text = text.replace(repeats, "\n\n")[1:]
+        if last:
+            text = self._without_end(text.rstrip("\n\0 "), first)
+        self._lines += text.count("\n")
+        try:
+            frame = self._parsed(text, first if not self._parts else 0)
+        except (pd.errors.ParserError, pd.errors.ParserWarning):
+            frame = self._parsed(text, first)  # the message names the line of the file
+        frame.index = pd.RangeIndex(first + 1, len(frame) + first + 1)
+        frame = frame.dropna(how="all")
+        self._rows.append(frame.index.to_numpy())
+        self._parts.append({k: frame[k].to_numpy() for k in frame})
+
+    def _parsed(self, text: str, above: int) -> pd.DataFrame:
+        """Parse lines below a number of others, which are empty: quotes may be unbalanced there."""
+        separator = self._dialect.separator
+        with warnings.catch_warnings():
+            # pandas would cut rows that are longer than the header, and only warn.
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            return pd.read_csv(
+                io.BytesIO(("\n" * above + text).encode()),
+                skiprows=above,
+                sep=r"\s+" if separator == " " else separator,
+                decimal=self._dialect.decimal,
+                header=None,
+                names=range(self._width),
+                na_values=_NO_VALUES,
+                skipinitialspace=True,
+                skip_blank_lines=False,
+                low_memory=False,
+                index_col=False,
+            )
+
+    def frame(self) -> pd.DataFrame:
+        """Return all rows; each column takes its memory once."""
+        columns = {
+            k: np.concatenate([part.pop(k) for part in self._parts]) for k in range(self._width)
+        }
+        index = pd.Index(np.concatenate(self._rows))
+        return pd.DataFrame(columns, index=index, copy=False)
+
+    def all_notes(self) -> list[str]:
+        """Return what was repaired."""
+        text = f"{self._repeats} lines that repeat the header are dropped: a restarted recorder?"
+        return [text] * bool(self._repeats) + self._notes
+
+    def _without_end(self, text: str, before: int) -> str:
+        """Return the lines without a last one that is cut short."""
+        end = text.rsplit("\n", _FOOTER)
+        widths = [len(self._dialect.cells(line)) for line in end[:0:-1]]
+        short = next((k for k, width in enumerate(widths) if width >= self._dialect.width), 0)
+        if not short:
+            return text
+        text = "\n".join(end[:-short])
+        first = before + text.count("\n") + 2
+        self._notes.append(
+            f"{short} lines from line {first} on are dropped, they are shorter than the rows, as "
+            f"is {end[-1][:80]!r}"
+        )
+        return text
+
+
+def _of_frames(
+    frame: pd.DataFrame, rate: float, notes: list[str]
+) -> tuple[pd.DataFrame, list[str]]:
+    """Return the rows with their time by the numbers of the frames, and a note on missing ones."""
+    numbers = frame[_FRAME].to_numpy(float)
+    missing = np.flatnonzero(np.diff(numbers) > 1)
+    if len(missing):
+        count = int((np.diff(numbers)[missing] - 1).sum())
+        text = f"{count} frames are missing, the first after frame {numbers[missing[0]]:g}"
+        notes = [*notes, f"{text}: time: {{columns: {_TIME}}} counts frames, not rows"]
+    if _TIME not in frame:
+        frame = frame.assign(**{_TIME: (numbers - numbers[0]) / rate})
+    return frame, notes
 
 
 def _decoded(content: bytes) -> str:
@@ -173,7 +279,8 @@ def _header(
                 best, names = score, candidate
     header = best[-1]
     names[0] = names[0] or "index"
-    if header < 0 and dialect.cells("".join(lines[first : first + 1])) == names:
+    numbers = dialect.cells("".join(lines[first : first + 1]))
+    if header < 0 and dialect.width > 1 and numbers == names:
         header, first = first, first + 1  # pandas numbers columns without names
     return names, header, first
 
@@ -201,27 +308,10 @@ def _units(lines: Sequence[str], dialect: _Dialect, names: Sequence[str]) -> dic
     return units
 
 
-def _repaired(body: str, header: str | None, dialect: _Dialect) -> tuple[str, list[str]]:
-    """Return the rows without comments, repeated headers and a last line cut short, with notes."""
-    notes = []
-    if any(mark in body for mark in _COMMENTS):
-        body = re.sub(rf"(?m)^[ \t]*(?:{'|'.join(_COMMENTS)}).*$", "", body)
-    if header and (repeats := body.count(f"\n{header}\n")):
-        notes.append(f"{repeats} lines that repeat the header are dropped: a restarted recorder?")
-        body = body.replace(f"\n{header}\n", "\n\n")
-    body = body.rstrip("\n\0 ")
-    end = body.rsplit("\n", _FOOTER)
-    widths = [len(dialect.cells(line)) for line in end[:0:-1]]
-    if short := next((k for k, width in enumerate(widths) if width >= dialect.width), 0):
-        body = "\n".join(end[:-short])
-        text = f"{short} lines from line {body.count(chr(10)) + 2} on are dropped, they are"
-        notes.append(f"{text} shorter than the rows, as is {end[-1][:80]!r}")
-    return body, notes
-
-
 def _with_vectors(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     """Name the columns; a column of vectors becomes ``name_1``, ``name_2`` and so on."""
-    frames = []
+    columns: dict[int, pd.Series] = {}
+    labels: list[str] = []
     for name, (_, column) in zip(names, frame.items(), strict=True):
         part = {name: column}
         if not pd.api.types.is_numeric_dtype(column):
@@ -229,5 +319,8 @@ def _with_vectors(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
             if len(cells) and cells.map(_VECTOR.fullmatch).notna().all():
                 vectors = cells.str.strip("aryARY[](){} ,;").str.split(r"[\s,;]+")
                 part = vector_columns(name, vectors.reindex(column.index))
-        frames.append(pd.DataFrame(part))
-    return pd.concat(frames, axis=1)
+        for label, values in part.items():
+            columns[len(labels)] = values
+            labels.append(label)
+    table = pd.DataFrame(columns, index=frame.index, copy=False)
+    return table.set_axis(labels, axis=1)

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinn_dyn.data.logs.check.averages import Averages
+from pinn_dyn.log_check.averages import Averages
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Maps q, v, a ``(R, N)`` to the Y ``(R, N, P)`` of rigid bodies: their torque is Y pi."""
+GROUPS = 10
+"""Parts of the data that a jackknife leaves out in turn."""
 _RIDGE = 1e-9
+_RICH = 3  # independent rows at least for a term of a rich equation
 _MOST = 400  # terms, for the time that a regression takes
 _ITERATIONS = 7  # of reweighted least squares
 
@@ -117,6 +120,12 @@ class EquationOfMotionRegression:
             weights = 1 / (1 + (worst / max(2.5, cut * worst.max())) ** 2) ** 2
         return (weights * base)[None]
 
+    def held_out(self, y: str, x: Sequence[str]) -> np.ndarray:
+        """Return the squares of each block that a fit to the other blocks leaves, ``(B, K)``."""
+        squares = self.fit(y, x, self.jackknife()[1:]).squares
+        blocks = np.arange(len(self.numbers))
+        return np.asarray(squares[blocks, blocks])
+
     def spreads(self, totals: np.ndarray) -> np.ndarray:
         """Return the root mean squares of blocks over the median one, ``(B, K)``."""
         means = np.sqrt(totals / np.bincount(self.block)[:, None])
@@ -128,9 +137,10 @@ class EquationOfMotionRegression:
 
         The share is that of the median block if that block has a larger y.
         """
-        spreads = self.spreads(fit.totals)
-        shares = np.sqrt(fit.squares[0] / fit.totals.clip(min=1e-300))
-        return shares * np.minimum(spreads, 1) * (spreads > 0)
+        counts = np.bincount(self.block)[:, None]
+        means = np.sqrt(fit.totals / counts)
+        usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0)).clip(min=1e-300)
+        return np.sqrt(fit.squares[0] / counts) / np.maximum(means, usual)
 
 
 def terms(data: Averages, form: str) -> np.ndarray:
@@ -150,6 +160,46 @@ def terms(data: Averages, form: str) -> np.ndarray:
             (trig[:, :, None] * x[:, None, :]).reshape(len(x), -1) for x in [*inertial, trig[:, 1:]]
         ]
         count = sum(x.shape[1] for x in products)
-        rich = 12 * count < len(q) and count < _MOST
+        rich = _RICH * count < data.independent_rows() and count < _MOST
         parts += products if rich else inertial
     return np.hstack(parts)
+
+
+def force_columns(data: Averages, i: int, rigid: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return the columns that explain input i: terms, sign of v, and sign of slow v.
+
+    Args:
+        data: the averages.
+        i: number of the input.
+        rigid: regressor of rigid bodies at the rows, ``(R, N, P)``. Without it, the terms are
+            generic, and the signs of all joints count.
+    """
+    if rigid is None:
+        return {
+            "terms": terms(data, "inverse dynamics"),
+            "sign": data.sign,
+            "slow": data.slow_sign,
+        }
+    size = data.q.shape[1]
+    drive = [data.a[:, i], data.v[:, i], np.ones(len(data))]
+    return {
+        "terms": np.column_stack([rigid[:, i], *drive]),
+        "sign": data.sign[:, [i]],
+        "slow": data.slow_sign[:, [i, size + i]],
+    }
+
+
+def bodies(data: Averages, rigid: Regressor | None) -> np.ndarray | None:
+    """Return the regressor of rigid bodies at the rows, ``(R, N, P)``, or None without a robot."""
+    return None if rigid is None else rigid(data.q, data.v, data.a)
+
+
+def tenths(data: Averages) -> np.ndarray:
+    """Return the number of the tenth of the rows that a row belongs to, ``(R,)``.
+
+    Parts of less than a second depend on each other: short logs have fewer parts, at least three.
+    """
+    inside = np.diff(data.stretch) == 0
+    seconds = np.diff(data.t)[inside].clip(max=0.1).sum()
+    groups = int(np.clip(seconds, 3, GROUPS))
+    return np.arange(len(data)) * groups // len(data)

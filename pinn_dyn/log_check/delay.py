@@ -18,20 +18,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
-from pinn_dyn.data.logs.check.averages import Averages, with_products
-from pinn_dyn.data.logs.check.equation import EquationOfMotionRegression, Regressor, terms
-from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs import Recording
+from pinn_dyn.log_check.averages import Averages, averages_of_widths, with_products
+from pinn_dyn.log_check.equation import (
+    GROUPS,
+    EquationOfMotionRegression,
+    Regressor,
+    bodies,
+    force_columns,
+    tenths,
+    terms,
+)
 
-_WIDTHS = (0.005, 0.01, 0.02, 0.04, 0.08)  # of the kernel, s
 _CANDIDATES = 60  # at most: a parabola finds what is between them
-_NOISE = 0.01  # largest part of the variance of the acceleration that is noise
 _DEPTH = 0.8  # largest residual as a share of its median
 _SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 ms
 _UNEXPLAINED = 0.4  # largest residual
 _WORSE = 2.0  # residual over that of the best equation of motion, beyond which it is left out
-_GROUPS = 10  # of the data that the jackknife leaves out in turn
-FEWEST = 20 * _GROUPS
+FEWEST = 20 * GROUPS
 """Smallest number of rows of a regression."""
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
@@ -52,6 +58,7 @@ class DelayCurve:
         spread: standard deviation of the estimate by the jackknife and over kernels, s.
         friction: dry friction over the spread of the input; NaN if it is not determined.
         friction_spread: standard deviation of ``friction`` by the jackknife.
+        other: curve of the other equation of motion, if its smallest residual is elsewhere.
         form: equation of motion.
         reason: reason why there is no delay, "" otherwise.
     """
@@ -64,6 +71,16 @@ class DelayCurve:
     reason: str = ""
     friction: float = np.nan
     friction_spread: float = np.nan
+    other: DelayCurve | None = None
+
+    @property
+    def of_bodies(self) -> bool:
+        """True if the equation is that of rigid bodies."""
+        return self.form == _RIGID
+
+    def without(self, reason: str) -> DelayCurve:
+        """Return the curve without a delay, for a reason."""
+        return replace(self, delay=None, reason=reason)
 
     @property
     def dry(self) -> bool:
@@ -72,7 +89,11 @@ class DelayCurve:
 
 
 def input_delays(
-    recordings: Sequence[Recording], *, longest: float = 0.3, rigid: Regressor | None = None
+    recordings: Sequence[Recording],
+    *,
+    longest: float = 0.3,
+    rigid: Regressor | None = None,
+    widths: Sequence[Averages] | None = None,
 ) -> list[DelayCurve]:
     """Estimate the delay of each input, or one for all if there are more inputs than coordinates.
 
@@ -80,6 +101,7 @@ def input_delays(
         recordings: stretches of one uniform sample time.
         longest: longest delay that is tried, s.
         rigid: regressor Y of a rigid robot with one input per joint, or None.
+        widths: averages of the recordings with several kernels; None computes them.
 
     Raises:
         LogError: if a clock is not uniform.
@@ -89,36 +111,38 @@ def input_delays(
     if not inputs:
         return []
     stride = max(1, round(longest / step / _CANDIDATES))
-    lags = stride * np.arange(-2, max(round(longest / step / stride), 3) + 1)
-    parts = [with_products(x) for x in recordings] if inputs > size else recordings
-    widths = sorted({max(width, 1.5 * step) for width in _WIDTHS})
-    trials = [Averages.of(parts, step, width, lags) for width in widths]
-    enough = [data for data in trials if data is not None and len(data.t) >= FEWEST]
-    if not enough:
-        short = "the stretches are too short"
-        return [DelayCurve(lags * step, np.ones(len(lags)), None, np.inf, "none", short)] * inputs
+    candidates = stride * step * np.arange(-2, max(round(longest / step / stride), 3) + 1)
+    if widths is None:
+        parts = [with_products(x) for x in recordings] if inputs > size else recordings
+        widths = averages_of_widths(parts, step)
+    trials = [
+        data.rows((data.since >= candidates[-1]) & (data.left >= -candidates[0])) for data in widths
+    ]
+    trials = [data for data in trials if len(data) >= FEWEST]
+    if not trials:
+        ones, short = np.ones(len(candidates)), "the stretches are too short"
+        return [DelayCurve(candidates, ones, None, np.inf, "none", short)] * inputs
     forms: dict[str, list[list[DelayCurve]]] = {}
-    smooth = [data for data in enough if data.noise.max() < _NOISE] or enough[-1:]
-    for data in smooth:
-        for form, curves in _curves(data, inputs, rigid, lags * step).items():
+    for data in trials:
+        for form, curves in _curves(data, inputs, rigid, candidates).items():
             forms.setdefault(form, []).append(curves * (inputs // len(curves)))
     best = {
         form: [_best(curves) for curves in zip(*trials, strict=True)]
         for form, trials in forms.items()
     }
-    bodies = best.pop(_RIGID, None)
+    of_bodies = best.pop(_RIGID, None)
     curves = _agreed(list(best.values()), step)
-    if bodies is not None:
-        curves = [
-            of_bodies if not of_bodies.reason else curve
-            for curve, of_bodies in zip(curves, bodies, strict=True)
-        ]
-    reason = "the input is a single sine, whose delay looks like damping"
-    sines = [all(_is_sine(item.u[:, i]) for item in recordings) for i in range(inputs)]
-    return [
-        replace(curve, delay=None, reason=reason) if sine else curve
-        for curve, sine in zip(curves, sines, strict=True)
-    ]
+    if of_bodies is not None:
+        pairs = zip(curves, of_bodies, strict=True)
+        curves = [_better(generic, rigid_curve, step) for generic, rigid_curve in pairs]
+    for i in range(inputs):
+        signals = [item.u[:, i] for item in recordings]
+        if not any(np.ptp(x) for x in signals):
+            curves[i] = curves[i].without("the input is constant")
+        elif all(_is_sine(x) for x in signals):
+            reason = "the input is a single sine, whose delay looks like damping"
+            curves[i] = curves[i].without(reason)
+    return curves
 
 
 def clear_delays(curves: Sequence[DelayCurve], step: float) -> list[float]:
@@ -142,6 +166,14 @@ def clear_delays(curves: Sequence[DelayCurve], step: float) -> list[float]:
     return np.where(clear, values, 0.0).tolist()
 
 
+def _better(generic: DelayCurve, rigid: DelayCurve, step: float) -> DelayCurve:
+    """Return the curve of rigid bodies if it has a delay, with the generic one if they differ."""
+    best, other = (rigid, generic) if not rigid.reason else (generic, rigid)
+    places = [minimum(x.candidates, x.residual) for x in (best, other)]
+    differ = other.form != best.form and abs(places[0] - places[1]) > step
+    return replace(best, other=other if differ else None)
+
+
 def _agreed(forms: Sequence[list[DelayCurve]], step: float) -> list[DelayCurve]:
     """Return the curves of the clearest equation, without delays that an equally good one denies.
 
@@ -163,7 +195,7 @@ def _best(curves: Sequence[DelayCurve]) -> DelayCurve:
     """Return the clearest curve; its spread includes kernels of other widths that are as clear."""
     best = min(curves, key=_rank)
     clear = [x for x in curves if x.spread <= 2 * best.spread]
-    width = np.std([_minimum(x.candidates, x.residual) for x in clear])
+    width = np.std([minimum(x.candidates, x.residual) for x in clear])
     return replace(best, spread=float(np.hypot(best.spread, width)))
 
 
@@ -187,53 +219,39 @@ def _curves(
             form: [_motion_curve(data, form, motion, candidates)]
             for form, motion in (("increments", data.v), ("acceleration", data.a))
         }
-    forms = {_INVERSE: [_input_curve(data, i, inputs, None, candidates) for i in range(inputs)]}
-    if rigid is not None and inputs == size:
-        forms[_RIGID] = [_input_curve(data, i, inputs, rigid, candidates) for i in range(inputs)]
+    forms = {_INVERSE: [_input_curve(data, i, None, candidates) for i in range(inputs)]}
+    regressor = bodies(data, rigid) if inputs == size else None
+    if regressor is not None:
+        curves = [_input_curve(data, i, regressor, candidates) for i in range(inputs)]
+        for i, generic in enumerate(forms[_INVERSE]):
+            if curves[i].residual.min() > _WORSE * generic.residual.min():
+                # A delay would make up for a force that the bodies lack.
+                curves[i] = replace(generic, form=_INVERSE)
+        forms[_RIGID] = curves
     return forms
 
 
 def _input_curve(
-    data: Averages, i: int, inputs: int, rigid: Regressor | None, candidates: np.ndarray
+    data: Averages, i: int, regressor: np.ndarray | None, candidates: np.ndarray
 ) -> DelayCurve:
     """Return the curve of input i by inverse dynamics, generic or of rigid bodies."""
-    moving = data.moving_rows(i, inputs)
-    form = _INVERSE if rigid is None else _RIGID
+    moving = data.moving_rows(i)
+    form = _INVERSE if regressor is None else _RIGID
     if moving.sum() < FEWEST:
         ones = np.ones(len(candidates))
         return DelayCurve(candidates, ones, None, np.inf, form, "the joint hardly moves")
     data = data.rows(moving)
-    columns = force_columns(data, i, rigid)
-    u = data.u[:, :, i] - data.u[:, :, i].mean(axis=0)
-    regression = EquationOfMotionRegression({**columns, "u": u}, _tenths(data))
+    columns = force_columns(data, i, None if regressor is None else regressor[moving])
+    u = data.input_at(i, data.t[:, None] - candidates)
+    regression = EquationOfMotionRegression({**columns, "u": u - u.mean(axis=0)}, tenths(data))
     weights = regression.jackknife()
     shares = regression.fit("u", list(columns), weights).shares()
     # The level of the friction is that without its rise at low speed.
     level = regression.fit("u", ["terms", "sign"], weights).theta[:, columns["terms"].shape[1] :]
     own = i if columns["sign"].shape[1] > 1 else 0
-    friction = level[:, own] / data.spread[i] if inputs == data.q.shape[1] else np.nan * shares
+    square = data.u.shape[1] == data.q.shape[1]
+    friction = level[:, own] / data.spread[i] if square else np.nan * shares
     return _curve(candidates, shares, friction, form)
-
-
-def force_columns(data: Averages, i: int, rigid: Regressor | None) -> dict[str, np.ndarray]:
-    """Return the columns that explain input i: terms, sign of v, and sign of slow v.
-
-    Without a structure, the signs of all joints count.
-    """
-    if rigid is None:
-        return {
-            "terms": terms(data, "inverse dynamics"),
-            "sign": data.sign,
-            "slow": data.slow_sign,
-        }
-    bodies = rigid(data.q, data.v, data.a)[:, i]
-    drive = [data.a[:, i], data.v[:, i], np.ones(len(bodies))]
-    size = data.q.shape[1]
-    return {
-        "terms": np.column_stack([bodies, *drive]),
-        "sign": data.sign[:, [i]],
-        "slow": data.slow_sign[:, [i, size + i]],
-    }
 
 
 def _motion_curve(
@@ -242,16 +260,14 @@ def _motion_curve(
     """Return the curve of all inputs by v or a ``(R, N)``."""
     spread = motion.std(axis=0).clip(min=1e-300)
     columns = {"terms": terms(data, form), "motion": (motion - motion.mean(axis=0)) / spread}
-    columns |= {f"u{k}": data.u[:, k] for k in range(len(candidates))}
-    regression = EquationOfMotionRegression(columns, _tenths(data))
+    times = data.t[:, None] - candidates
+    inputs = np.stack([data.input_at(i, times) for i in range(data.u.shape[1])], axis=2)
+    columns |= {f"u{k}": inputs[:, k] for k in range(len(candidates))}
+    regression = EquationOfMotionRegression(columns, tenths(data))
     weights = regression.jackknife()
     fits = [regression.fit("motion", ["terms", f"u{k}"], weights) for k in range(len(candidates))]
     shares = np.stack([fit.shares().mean(axis=1) for fit in fits], axis=1)
     return _curve(candidates, shares, np.full_like(shares, np.nan), form)
-
-
-def _tenths(data: Averages) -> np.ndarray:
-    return np.arange(len(data.t)) * _GROUPS // len(data.t)
 
 
 def _curve(
@@ -260,8 +276,10 @@ def _curve(
     """Return the curve of the shares that each delay leaves, ``(B + 1, D)``, with its verdict."""
     gap = candidates[1] - candidates[0]
     residual, best = shares[0], int(shares[0].argmin())
-    minima = np.array([_minimum(candidates, share) for share in shares[1:]])
+    minima = np.array([minimum(candidates, share) for share in shares[1:]])
     spread = float(np.sqrt((len(minima) - 1) * minima.var()))
+    # Few parts leave the spread uncertain.
+    spread *= float(scipy.stats.t.ppf(0.975, len(minima) - 1)) / INTERVAL
     reason = ""
     if residual[best] > _UNEXPLAINED:
         reason = f"the equation leaves {100 * residual[best]:.0f} % unexplained at any delay"
@@ -273,7 +291,7 @@ def _curve(
         reason = f"the residual still falls at the longest delay, {candidates[-1]:.3g} s"
     elif best == 0:
         reason = _AFTER
-    delay = max(_minimum(candidates, residual), 0.0)
+    delay = max(minimum(candidates, residual), 0.0)
     level, parts = friction[0, best], friction[1:, best]
     level_spread = float(np.sqrt((len(parts) - 1) * parts.var()))
     return DelayCurve(
@@ -281,7 +299,8 @@ def _curve(
     )
 
 
-def _minimum(candidates: np.ndarray, residual: np.ndarray) -> float:
+def minimum(candidates: np.ndarray, residual: np.ndarray) -> float:
+    """Return the position of the smallest residual, by a parabola through three candidates."""
     k = int(np.clip(np.argmin(residual), 1, len(residual) - 2))
     before, at, after = residual[k - 1 : k + 2]
     bend = before - 2 * at + after
