@@ -1,6 +1,7 @@
 """Settings for all tests."""
 
 import gc
+import os
 from contextlib import nullcontext
 
 import pytest
@@ -60,6 +61,15 @@ def language(request):
     """What the reader of messages writes: both are followed."""
     with command_line() if request.param == "yaml" else nullcontext():
         yield request.param
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory):
+    """The verdicts of checks and decoded bags of tests stay out of the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "PINN_DYN_CACHE" not in os.environ:
+            patch.setenv("PINN_DYN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture

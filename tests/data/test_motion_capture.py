@@ -110,3 +110,17 @@ def test_the_section_with_the_columns_is_read(tmp_path):
     (frame,) = read_tables(path, Request("", columns)).values()
     assert len(frame) == 50
     assert frame.column(columns[0], "u").eq(1.0).all()
+
+
+def test_missing_frames_are_named_and_the_frames_give_the_time(tmp_path):
+    """Vicon states its rate and numbers its frames, which rows do not count."""
+    rows = [f"{k},0,{np.sin(0.01 * k)},{np.cos(0.01 * k)},0" for k in range(1, 400) if k != 200]
+    head = ["Trajectories", "100", ",,arm:tip,,", "Frame,Sub Frame,X,Y,Z", ",,mm,mm,mm"]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join([*head, *rows]))
+    (table,) = read_tables(path, Request("Time", ["Time", "arm:tip:X"])).values()
+    assert table.frame["Time"].iloc[[0, 198, 199]].tolist() == pytest.approx([0, 1.98, 2.0])
+    assert table.notes == [
+        "1 frames are missing, the first after frame 199: time: {columns: Time} counts frames, not "
+        "rows"
+    ]

@@ -1,6 +1,7 @@
 """The check of a log: measurements with verdicts, and the two steps that it measures."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -12,8 +13,10 @@ from hypothesis import strategies as st
 import pinn_dyn
 from pinn_dyn.data.bandwidth import bandwidth
 from pinn_dyn.data.logs import Butterworth, LogSource, MovingAverage, Recording
+from pinn_dyn.log_check import figures
 from pinn_dyn.log_check.averages import white_noise
-from pinn_dyn.log_check.check import check
+from pinn_dyn.log_check.check import check, verdict
+from pinn_dyn.log_check.delay import DelayCurve
 from pinn_dyn.models import CoulombFriction
 from pinn_dyn.wording import command_line
 from tests.support.delayed_robots import resting
@@ -41,9 +44,8 @@ def driven(delay=0.0, noise=0.0, seconds=60.0, seed=0):
     return pd.DataFrame(table)
 
 
-def checked(frame, **changes):
-    arguments = dict(
-        name="masses",
+def settings(frame):
+    return dict(
         files=frame,
         time=dict(columns="t", unit="s"),
         q=dict(columns=["q1", "q2"], unit="m"),
@@ -51,7 +53,10 @@ def checked(frame, **changes):
         validation=dict(seconds=4.0, piece=2.0),
         test=dict(seconds=8.0, piece=4.0),
     )
-    return check(LogSource(**{**arguments, **changes}))
+
+
+def checked(frame, **changes):
+    return check(LogSource(**{"name": "masses", **settings(frame), **changes}))
 
 
 @pytest.fixture(scope="module")
@@ -241,3 +246,41 @@ def test_the_unit_of_the_inputs_selects_the_models(unit):
     result = checked(driven(), u=dict(columns=["u1", "u2"], unit=unit))
     assert [x[1][0] for x in result.candidates] == KINDS[unit]
     assert all(reason in str(result) for reason, _ in result.candidates)
+
+
+def test_the_figures_have_the_units_of_the_log_and_the_mean_of_the_residual():
+    """A spring that only pulls on one side stays in the residual over q."""
+    frame = driven(noise=1e-5)
+    frame["u1"] += 2.0 * np.maximum(frame["q1"] - 1.0, 0)
+    frame[["q1", "q2"]] *= 1000
+    result = checked(frame, q=dict(columns=["q1", "q2"], unit="mm"))
+    figure = figures.residuals(result.motion, result.source.q, None)
+    grid = np.reshape(figure.axes, (2, 2))
+    assert [ax.get_xlabel() for ax in grid[0]] == ["q1 [mm]", "d/dt q1 [mm/s]"]
+    x, mean = grid[0, 0].lines[1].get_data()
+    assert 1000 < np.abs(x).max() < 5000
+    assert np.ptp(mean) > 3 * np.ptp(grid[1, 0].lines[1].get_data()[1])
+
+
+def test_the_curve_of_the_other_equation_is_drawn_where_it_differs():
+    d = np.arange(-2, 20) * 0.01
+    curves = [
+        DelayCurve(d, (d - x) ** 2 + 0.1, x, 1e-3, form) for x, form in ((0.05, "a"), (0.1, "b"))
+    ]
+    both = replace(curves[0], other=curves[1])
+    figure = figures.delay_curves([both], ["u1"])
+    assert [line.get_label() for line in figure.axes[0].lines if line.get_label()[0] != "_"] == [
+        "u1",
+        "u1, b",
+    ]
+
+
+def test_a_training_asks_the_verdict_of_the_same_numbers(tmp_path, monkeypatch):
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
+    frame = driven(delay=0.05, noise=1e-5)
+    source = checked(frame).source
+    assert "acts 50" in verdict(source)[0]
+    same = LogSource(**settings(frame), name="another name")
+    assert verdict(same) == verdict(source)
+    changed = LogSource(**settings(frame.assign(u1=frame["u1"] + 1e-9)), name="masses")
+    assert verdict(changed) == []
