@@ -106,7 +106,7 @@ class Watch:
             self._function(value)
         elif isinstance(value, type):
             self._class(value)
-        elif getattr(value, "is_unwatched", False):
+        elif getattr(type(value), "is_unwatched", False):
             return
         elif not isinstance(value, (types.ModuleType, types.BuiltinFunctionType)):
             self._object(value)
@@ -150,7 +150,7 @@ class Watch:
     def _class(self, kind: type) -> None:
         self._words.append(f"{kind.__module__}.{kind.__qualname__}")
         for base in kind.__mro__:
-            if base.__module__.partition(".")[0] in _LIBRARIES:
+            if _is_library(base.__module__):
                 continue
             members = {x: y for x, y in vars(base).items() if x not in _CLASS}
             self._part(vars(base), members)
@@ -160,7 +160,7 @@ class Watch:
 
     def _function(self, function: types.FunctionType) -> None:
         self._words.append(function.__qualname__)
-        if function.__module__ is None or function.__module__.partition(".")[0] in _LIBRARIES:
+        if _is_library(function.__module__):
             if function.__closure__ is None:
                 return
         else:
@@ -186,8 +186,16 @@ class Watch:
                 if not isinstance(item, types.ModuleType):
                     self._words.append(name)
                     self._visit(item)
-                elif item.__name__.partition(".")[0] not in _LIBRARIES:
+                elif not _is_library(item.__name__):
                     spaces += [vars(item)] * all(x is not vars(item) for x in spaces)
+
+
+@functools.cache
+def _is_library(module: str | None) -> bool:
+    """Return true for a module whose functions stay as they are: of Python, or installed."""
+    package = str(module).partition(".")[0]
+    file = getattr(sys.modules.get(package), "__file__", None) or ""
+    return module is None or package in _LIBRARIES or "site-packages" in Path(file).parts
 
 
 def _looked_up(space: Mapping[str, Any], names: Sequence[str]) -> list[Any]:
