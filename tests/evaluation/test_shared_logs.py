@@ -14,6 +14,7 @@ from pinn_dyn.data.logs import LogError, LogSource
 from pinn_dyn.log_check.check import check
 from pinn_dyn.run.known_data import match_structure
 from pinn_dyn.systems import RigidChain
+from pinn_dyn.wording import command_line
 from tests.support.composing import compose
 
 CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
@@ -75,6 +76,13 @@ REFUSED = {
     "59-csv-vector-cells": "did you mean position_",
 }
 NOTED = {"28-bag-stamp-zero": ["its times are those of receipt"]}
+
+
+@pytest.fixture(autouse=True)
+def _worded_for_the_command_line():
+    """Blocks are pasted into YAML."""
+    with command_line():
+        yield
 
 
 @pytest.fixture(scope="module")
