@@ -21,7 +21,6 @@ CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
 pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="needs the folder ../shared/cases")
 
 OUTSIDE = r"% of the test is outside the training range"
-COULOMB = "model/friction=coulomb"
 WANTED = {
     # Name: a pattern of each finding in turn, and of them all the ones that stop a training.
     "00-clean": [],
