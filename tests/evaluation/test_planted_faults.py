@@ -219,7 +219,7 @@ PLANTED = {
         SCALE,
         ["'u2' is 0.02 t", "at the motor"],
     ),
-    "spring": (lambda: arm_runs(spring=(8, 0, 0)), True, FIT, ["model.springs=[joint0]"]),
+    "spring": (lambda: arm_runs(spring=(8, 0, 0)), True, FIT, ["springs=['joint0']"]),
     "homing": (lambda: edited(shifted(1.0)), True, FIT, ["joint1 is", "off: add -"]),
 }
 

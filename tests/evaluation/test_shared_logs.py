@@ -21,7 +21,6 @@ CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
 pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="needs the folder ../shared/cases")
 
 OUTSIDE = r"% of the test is outside the training range"
-COULOMB = "model/friction=coulomb"
 WANTED = {
     # Name: a pattern of each finding in turn, and of them all the ones that stop a training.
     "00-clean": [],
@@ -79,8 +78,8 @@ NOTED = {"28-bag-stamp-zero": ["its times are those of receipt"]}
 
 
 @pytest.fixture(autouse=True)
-def words():
-    """The printed settings are YAML."""
+def _worded_for_the_command_line():
+    """Blocks are pasted into YAML."""
     with command_line():
         yield
 
