@@ -72,7 +72,7 @@ def _gains(report: LogCheck, structure: Structure) -> list[str]:
     """
     names, units = getattr(structure, "joint_names", []), report.source.u.units
     options = []
-    if report.driven:
+    if report.driven and not hasattr(structure, "driven"):  # elastic joints name their own
         driven = joints_of(report.source.u.columns, names) or [names[k] for k in report.driven]
         options.append(f"model.driven_joints=[{','.join(driven)}]")
     if set(units) <= {"Nm", "N"}:
