@@ -72,9 +72,10 @@ def _gains(report: LogCheck, structure: Structure) -> list[str]:
     """
     names, units = getattr(structure, "joint_names", []), report.source.u.units
     options = []
-    if report.driven and not hasattr(structure, "driven"):  # elastic joints name their own
+    if report.driven and isinstance(structure, RigidChain):
         driven = joints_of(report.source.u.columns, names) or [names[k] for k in report.driven]
-        options.append(f"model.driven_joints=[{','.join(driven)}]")
+        if len(set(driven)) == len(driven):
+            options.append(f"model.driven_joints=[{','.join(driven)}]")
     if set(units) <= {"Nm", "N"}:
         return options
     scales = {x.place: x.value for x in report.measurements if x.name == SCALE and x.value > 0}

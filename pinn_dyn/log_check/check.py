@@ -273,7 +273,8 @@ def _candidates(
             "modes than coordinates"
         )
         return [(reason, ["experiment=oscillators"])]
-    forces = [("the inputs are forces", ["model=lnn", *friction])]
+    reason = "the inputs are forces" + ", the joints have dry friction" * dry
+    forces = [(reason, ["model=lnn", *friction])]
     if structure is not None or units <= _FORCES:
         return forces
     return [

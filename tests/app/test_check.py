@@ -46,7 +46,7 @@ def test_a_log_gets_a_verdict_a_page_and_a_step_to_copy(tmp_path, capsys):
     assert "a training makes sense, 2 warnings" in text
     assert re.search(r"^delay: 0\.0[45]", text, re.MULTILINE)
     page = (tmp_path / "out" / "check.html").read_text()
-    assert "residual over delay" in page
+    assert 'id="delays"' in page
     assert "delay: 0.0" in page
     assert page.count("<img") == 4
 
@@ -56,9 +56,7 @@ def printed_training(folder, capsys, table, effects, *settings):
     table.to_csv(folder / "joints.csv", index=False)
     words = ["dataset=csv_log", f"dataset.root='{folder}'", "dataset.files=joints.csv", *COLUMNS]
     run_script("check.py", *words, *settings, f"hydra.run.dir={folder / 'out'}")
-    (command,) = re.findall(
-        rf"a training(?:, the inputs are| of) {effects}: python (.*)", capsys.readouterr().out
-    )
+    (command,) = re.findall(rf"a training.* {effects}: python (.*)", capsys.readouterr().out)
     script, *words = shlex.split(command)
     small = ["trainer.steps=1", "trainer.validations=1", "data.pairs=64", "data.batch_size=64"]
     small += ["compile=false"] if "model=lnn" in words else ["optimizer.rollouts=false"]

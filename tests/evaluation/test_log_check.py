@@ -279,7 +279,7 @@ def test_a_training_asks_the_verdict_of_the_same_numbers(tmp_path, monkeypatch):
     monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
     frame = driven(delay=0.05, noise=1e-5)
     source = checked(frame).source
-    assert "acts 50" in verdict(source)[0]
+    assert "after it is logged" in verdict(source)[0]
     same = LogSource(**settings(frame), name="another name")
     assert verdict(same) == verdict(source)
     changed = LogSource(**settings(frame.assign(u1=frame["u1"] + 1e-9)), name="masses")
