@@ -39,7 +39,7 @@ def explained_share(data: Averages) -> float:
     """
     data = data.independent()
     q, v, u = data.q, data.v - data.v.mean(axis=0), data.u - data.u.mean(axis=0)
-    if len(data) < 3 * (3 * q.shape[1] + u.shape[1]):
+    if len(data) < 6 * (3 * q.shape[1] + u.shape[1]):
         return 1.0
     known = q, np.sin(q), np.cos(q)
     return max(

@@ -70,7 +70,7 @@ def test_the_printed_training_has_the_friction_of_the_log(tmp_path, capsys):
     item = resting(0.3)
     table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
     table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
-    model = printed_training(tmp_path, capsys, pd.DataFrame(table), "forces")
+    model = printed_training(tmp_path, capsys, pd.DataFrame(table), "dry friction")
     assert isinstance(model.friction, CoulombFriction)
 
 
@@ -82,7 +82,7 @@ def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
         target = 0.4 * np.sin(6.28 * frequency * t) + 0.3 * np.sin(6.28 * 1.7 * frequency * t)
         poles = lfilter([0.0, 0.02], [1, -1.75, 0.77], target)  # a lag of a few samples
         table |= {f"q{k}": poles, f"u{k}": target}
-    effects, unit = "targets of servos", "dataset.u.unit=rad"
+    effects, unit = "targets of servos.*", "dataset.u.unit=rad"
     model = printed_training(tmp_path, capsys, pd.DataFrame(table), effects, unit)
     assert isinstance(model.input, Servo)
 
