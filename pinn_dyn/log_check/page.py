@@ -155,7 +155,8 @@ class LogCheck:
         lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
         if self.block:
             lines += ["", "Append to the data set:", "", self.block]
-        if self.rigid is None and not self.problems:
+        # The command line prints whole commands.
+        if self.rigid is None and not self.problems and not wording.IN_YAML.get():
             lines += ["", *self.advice]
         return "\n".join(lines)
 

@@ -230,7 +230,7 @@ def test_inputs_in_the_unit_of_the_coordinates_are_no_targets_if_the_robot_does_
     assert result.candidates[0][1] == ["experiment=oscillators"]
     assert "model='oscillators'" in str(result)
     with command_line():
-        assert "experiment=oscillators" in str(result)
+        assert "experiment=oscillators" in result.advice[0]
 
 
 KINDS = {
