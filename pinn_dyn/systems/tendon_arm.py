@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pinn_dyn.systems.soft_arm import SoftArm
 
-PerSegment = Annotated[Sequence[NonNegativeFloat], Field(min_length=3, max_length=3)]
-"""A number for each coordinate of a segment."""
+PerSegment = Annotated[Sequence[NonNegativeFloat], Field(min_length=3)]
+"""A number for each coordinate of a segment, the same for all segments, or for all segments."""
 
 
 class TendonArm(SoftArm):
@@ -42,10 +42,12 @@ class TendonArm(SoftArm):
         tendon_stiffness: k, N/m.
         pretension: tension at q = 0 and u = 0, N.
         slack: stretch over which a tendon goes from slack to taut, m.
-        friction: largest dry friction of a segment, ``(3,)``, Nm and N.
-        friction_speed: speed at 76 % of that friction, ``(3,)``, rad/s and m/s.
+        friction: largest dry friction of a segment, ``(3,)`` or ``(3 n,)``, Nm and N.
+        friction_speed: speed at 76 % of that friction, ``(3,)`` or ``(3 n,)``, rad/s
+            and m/s.
         mass, length, gravity: see :class:`SoftArm`.
-        stiffness, damping: of the backbone of a segment, ``(3,)``, see :class:`SoftArm`.
+        stiffness, damping: of the backbone of a segment, ``(3,)`` or ``(3 n,)``, see
+            :class:`SoftArm`.
     """
 
     input_affine = False
@@ -72,20 +74,23 @@ class TendonArm(SoftArm):
         stiffness: PerSegment = (0.5, 0.5, 600.0),
         damping: PerSegment = (0.05, 0.05, 30.0),
     ):
-        elastic, viscous = (list(x) * segments for x in (stiffness, damping))
+        size = 3 * segments
+        elastic, viscous, level, speed = (
+            list(x) * (size // len(x)) for x in (stiffness, damping, friction, friction_speed)
+        )
         bodies: dict[str, Any] = {"mass": mass, "length": length, "gravity": gravity}
         super().__init__(segments, stiffness=elastic, damping=viscous, **bodies)
         self.num_inputs = segments * tendons
-        self.spool, self.pretension, self.slack = spool, pretension, slack
+        self.tendons, self.radius, self.spool = tendons, radius, spool
+        self.pretension, self.slack = pretension, slack
         self.constants |= {
             "tendon_stiffness": ["N/m"],
             "friction": ["Nm", "Nm", "N"] * segments,
             "friction_speed": ["rad/s", "rad/s", "m/s"] * segments,
         }
-        for name, value in (("friction", friction), ("friction_speed", friction_speed)):
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float64).repeat(segments))
-        stiffnesses = torch.tensor([tendon_stiffness], dtype=torch.float64)
-        self.register_buffer("tendon_stiffness", stiffnesses)
+        buffers = {"friction": level, "friction_speed": speed, "tendon_stiffness": tendon_stiffness}
+        for name, value in buffers.items():
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
         angles = 2 * math.pi / tendons * torch.arange(tendons, dtype=torch.float64)
         lengths = [-radius * angles.cos(), -radius * angles.sin(), torch.ones_like(angles)]
         upstream = torch.ones(segments, segments, dtype=torch.float64).tril()

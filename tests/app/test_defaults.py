@@ -5,6 +5,7 @@ import pkgutil
 from functools import partial
 
 import pytest
+import torch
 
 import pinn_dyn
 from pinn_dyn.app.config import CONF, composed
@@ -18,7 +19,7 @@ from pinn_dyn.models import (
 from pinn_dyn.run.build import built
 from pinn_dyn.run.described import described
 from pinn_dyn.run.run_folder import with_structures
-from pinn_dyn.systems import RigidChain, SoftArm
+from pinn_dyn.systems import RigidChain, SoftArm, TendonArm
 from pinn_dyn.training import SOAP, LeastSquares
 from tests.app.entry import ROOT
 
@@ -125,3 +126,11 @@ def test_settings_of_a_caller_are_kept_and_the_others_are_the_defaults(monkeypat
     model = partial(NextStateMLP, hidden=[8])
     config = of_python(monkeypatch, source, model)
     assert config["model"]["activation"] == "silu"
+
+
+@pytest.mark.parametrize("robot", [SoftArm(2, mass=[0.2, 0.3]), TendonArm(2, tendons=4)], ids=repr)
+def test_a_robot_is_built_again_from_its_description(robot):
+    again = built(described(robot))
+    assert described(again) == described(robot)
+    for name, value in robot.named_buffers():
+        torch.testing.assert_close(again.get_buffer(name), value, rtol=0, atol=0)
