@@ -351,17 +351,16 @@ class CFunction:
                 ]
                 self._loops({"b": len(block)}, body)
 
-    def _call(self, node: fx.Node, name: str, size: int, sources: Sequence[fx.Node]) -> None:
-        values = [*(source.meta["val"] for source in sources), self._declare(node)]
-        pointers = [f"&{self._element(value, ['0'])}" for value in values]
-        self.lines.append(f"{name}({', '.join([*self.constants.arguments, *pointers])});")
-
-    def _iterate(self, node: fx.Node, name: str, start: fx.Node, rows: fx.Node) -> None:
-        x, (count, size) = self._declare(node), rows.meta["val"].shape
-        self._assign(x, start)
-        state, row = (f"&{self._element(y, ['0'] * y.ndim)}" for y in (x, rows.meta["val"]))
-        arguments = [*self.constants.arguments, state, f"{row} + {size} * k", state]
-        self.lines.append(f"for (int k = 0; k < {count}; k++) {name}({', '.join(arguments)});")
+    def _call(self, node: fx.Node, name: str, start: fx.Node, rows: fx.Node, size: int) -> None:
+        """Write x <- name(x, row) for each row, where a single row may change the size of x."""
+        y, (count, width) = self._declare(node), rows.meta["val"].shape
+        x = y if count > 1 else start.meta["val"]
+        if count > 1:
+            self._assign(x, start)
+        places = [f"&{self._element(a, ['0'] * a.ndim)}" for a in (x, rows.meta["val"], y)]
+        places[1] += f" + {width} * k" * (count > 1)
+        loop = f"for (int k = 0; k < {count}; k++) " * (count > 1)
+        self.lines.append(f"{loop}{name}({', '.join([*self.constants.arguments, *places])});")
 
     def _reduction(self, node: fx.Node, source: fx.Node, dims: Any = None, keep: bool = False):
         start, step = REDUCTIONS[operation(node)]

@@ -15,7 +15,8 @@ from pinn_dyn.exports.c_code import PRELUDE
 from pinn_dyn.exports.c_lanes import LOOP, ONE, SEVERAL
 from pinn_dyn.exports.compiled import STATES, Compiled, Function, Kind, agree, spread_around
 from pinn_dyn.exports.live_numbers import LiveNumbers
-from pinn_dyn.exports.program import Program, calling_part, trace
+from pinn_dyn.exports.program import Program
+from pinn_dyn.exports.repeated import programs, sharing
 from pinn_dyn.exports.scalar_code import c_function
 from pinn_dyn.mechanics.compilation import Wrapped
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator
@@ -179,10 +180,9 @@ class Steps(Kind):
 def traced(dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor) -> dict[str, Program]:
     """Return the programs of a step of a model, after the part that it calls."""
     step = {"increment": torch.zeros_like(x), "start": x, "inputs": inputs, "h": h}
-    if x.ndim > 1 or not isinstance(dynamics, ContinuousPredictor):  # an ensemble, or no stages
-        return {"integration_step": trace(dynamics.integration_step, step, ["end"])}
-    copy, part = calling_part(dynamics, x, inputs[0])
-    return {"part": part, "integration_step": trace(copy.integration_step, step, ["end"])}
+    if x.ndim == 1 and isinstance(dynamics, ContinuousPredictor):  # no ensemble, with stages
+        dynamics = sharing(dynamics)
+    return programs("integration_step", dynamics.integration_step, step, ["end"])
 
 
 def loop_code(programs: dict[str, Program], numbers: LiveNumbers, several: bool) -> str:

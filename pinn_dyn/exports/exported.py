@@ -81,17 +81,13 @@ class ExportedFunction:
 
     def programs(self) -> dict[str, Program]:
         """Return the operations by name, first those of the parts that it calls."""
-        from pinn_dyn.exports.program import calling_part, trace
-        from pinn_dyn.exports.repeated import programs
+        from pinn_dyn.exports.repeated import programs, sharing
 
         example = {name: values[0] for name, values in self.inputs.items()}
-        if self._model is None:
-            return programs(self.name, self.function, example, self.outputs)
-        n, m = self._model.num_coordinates, self._model.num_inputs
-        state, u = torch.zeros(2 * n + m).double().split([2 * n, m])
-        calling, part = calling_part(self._model, state, u)
-        function = partial(self.function, model=calling)
-        return {"part": part, self.name: trace(function, example, self.outputs)}
+        function = self.function
+        if self._model is not None:
+            function = partial(function, model=sharing(self._model))
+        return programs(self.name, function, example, self.outputs)
 
     def compare(self, call: Call, real: Real) -> None:
         """Compare with a function of the file, whose numbers have the type ``real``.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import operator
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -19,8 +18,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from pinn_dyn.exports.decompositions import DECOMPOSITIONS
-from pinn_dyn.mechanics.compilation import Wrapped
-from pinn_dyn.mechanics.integrators import Sticking
 
 MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
 MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias detach copy"
@@ -377,51 +374,8 @@ def _line_of_code() -> str:
 _FOLDERS = (str(Path(torch.__file__).parent), str(Path(__file__).parent), contextlib.__file__)
 
 
-def _called(name: str, size: int, arguments: list[Tensor]) -> Tensor:
-    return arguments[0].new_ones(size)
-
-
 # torch.library.custom_op would import the compiler of PyTorch, which takes three seconds.
 if not hasattr(torch.ops.pinn_dyn, "call"):  # a module that is imported again
     _LIBRARY = torch.library.Library("pinn_dyn", "DEF")
-    _LIBRARY.define("call(str name, int size, Tensor[] arguments) -> Tensor")
-    _LIBRARY.impl("call", _called, "CompositeExplicitAutograd")
-    _LIBRARY.define("iterate(str name, Tensor x, Tensor rows) -> Tensor")
-    _LIBRARY.impl("iterate", lambda name, x, rows: x.clone(), "CompositeExplicitAutograd")
-_call = torch.ops.pinn_dyn.call
-"""Operation that stands for a call of a function with one result in a program."""
-
-
-def calling_part(model: Any, state: Tensor, u: Tensor) -> tuple[Any, Program]:
-    """Return a copy of a model whose programs call a part, and the program of the part.
-
-    The stages of a step share the part. It is the mass matrix and the bias force of a system with
-    sticking friction, in one array, or the state derivative of another model. The copy has the
-    tensors of the model.
-
-    Args:
-        model: a continuous predictor.
-        state, u: example of a state ``(S,)`` and an input ``(M,)``.
-    """
-    integrator = model.integrator
-    while isinstance(integrator, Wrapped):
-        integrator = integrator.inner
-    is_sticking = isinstance(integrator, Sticking)
-    name = "_mass_and_bias" if is_sticking else "state_derivative"
-    original, n = getattr(model, name), len(state) // 2
-    inputs = {"x": state[:n], "y": state[n:]} if is_sticking else {"x": state, "y": u}
-
-    def part(x: Tensor, y: Tensor) -> Tensor:
-        if not is_sticking:
-            return original(x, y)
-        mass, bias = original(x, y)
-        return torch.cat([mass.flatten(), bias])
-
-    def replacement(x: Tensor, y: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        size = n * (n + 1) if is_sticking else 2 * n
-        result = _call("part", size, [x.contiguous(), y.contiguous()])
-        return (result[: n * n].reshape(n, n), result[n * n :]) if is_sticking else result
-
-    calling = copy.copy(model)
-    vars(calling).update({name: replacement, "integrator": integrator})
-    return calling, trace(part, inputs, ["result"])
+    _LIBRARY.define("call(str name, Tensor x, Tensor rows, int size) -> Tensor")
+    _LIBRARY.impl("call", lambda name, x, rows, size: x.new_ones(size), "CompositeExplicitAutograd")

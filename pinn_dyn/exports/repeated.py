@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -20,8 +21,8 @@ Function = Callable[[Tensor, Tensor], Tensor]
 _PARTS: ContextVar[dict[str, tuple[Function, Tensor, Tensor]] | None]
 _PARTS = ContextVar("parts", default=None)
 """Repeated functions of the program that is recorded by name, with example arguments."""
-_CALLED: ContextVar[frozenset[str]] = ContextVar("called", default=frozenset())
-"""Repeated functions that the recorded program calls."""
+_SIZES: ContextVar[Mapping[str, int]] = ContextVar("sizes", default=MappingProxyType({}))
+"""Repeated functions that the recorded program calls, with the sizes of their results."""
 
 
 def repeated(name: str, function: Function, x: Tensor, rows: Tensor) -> Tensor:
@@ -29,12 +30,14 @@ def repeated(name: str, function: Function, x: Tensor, rows: Tensor) -> Tensor:
 
     Args:
         name: name of the function in C code.
-        function: takes x ``(*batch, S)`` and a row ``(*batch, R)``, and returns the next x.
+        function: takes x ``(*batch, S)`` and a row ``(*batch, R)``, and returns the next x. With
+            a single row, the result may have another size.
         x: the start.
         rows: the rows, the first one first.
     """
-    if name in _CALLED.get():
-        return torch.ops.pinn_dyn.iterate(name, x.contiguous(), rows.contiguous())
+    size = _SIZES.get().get(name)
+    if size is not None:
+        return torch.ops.pinn_dyn.call(name, x.contiguous(), rows.contiguous(), size)
     parts = _PARTS.get()
     if parts is not None and name not in parts:
         parts[name] = function, x.clone(), rows[..., 0, :].clone()
@@ -46,8 +49,8 @@ def repeated(name: str, function: Function, x: Tensor, rows: Tensor) -> Tensor:
 def sharing(model: Any) -> Any:
     """Return a shallow copy of a model whose steps call one function for all their stages.
 
-    The function is the mass matrix and the bias force of a system with sticking friction, or the
-    state derivative of another model.
+    The function is the mass matrix and the bias force of a system with sticking friction, in one
+    array, or the state derivative of another model. The copy has the tensors of the model.
     """
     shared, integrator = copy.copy(model), model.integrator
     while isinstance(integrator, Wrapped):
@@ -57,20 +60,18 @@ def sharing(model: Any) -> Any:
     def derivative(x: Tensor, u: Tensor) -> Tensor:
         return repeated("derivative", model.state_derivative, x, u.unsqueeze(-2))
 
-    def packed(x: Tensor, _: Tensor) -> Tensor:
-        mass, bias = model._mass_and_bias(x[..., :n], x[..., n : 2 * n])
+    def packed(q: Tensor, v: Tensor) -> Tensor:
+        mass, bias = model._mass_and_bias(q, v)
         return torch.cat([mass.flatten(-2), bias], dim=-1)
 
     def mass_and_bias(q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        unused = q.new_zeros(*q.shape[:-1], n * (n + 1))
-        x = torch.cat([q, v, unused[..., 2 * n :]], dim=-1)
-        result = repeated("mass_and_bias", packed, x, unused[..., None, :1])
+        result = repeated("mass_and_bias", packed, q, v.unsqueeze(-2))
         return result[..., : n * n].unflatten(-1, (n, n)), result[..., n * n :]
 
     if isinstance(integrator, Sticking):
-        shared._mass_and_bias = mass_and_bias
+        vars(shared).update(integrator=integrator, _mass_and_bias=mass_and_bias)
     else:
-        shared.state_derivative = derivative
+        vars(shared).update(integrator=integrator, state_derivative=derivative)
     return shared
 
 
@@ -83,11 +84,13 @@ def programs(
     """Return the operations of a function by its name, after those of its repeated functions."""
     with _set(_PARTS, {}) as parts, torch.no_grad():
         function(*inputs.values())
-    result = {}
+    result: dict[str, Program] = {}
+    sizes: dict[str, int] = {}
     for part, (repeated_function, x, row) in reversed(parts.items()):
-        with _set(_CALLED, frozenset(parts) - {part}):
+        with _set(_SIZES, sizes):
             result[part] = trace(repeated_function, {"x": x, "y": row}, ["result"])
-    with _set(_CALLED, frozenset(parts)):
+        sizes = {**sizes, part: result[part].outputs["result"].numel()}
+    with _set(_SIZES, sizes):
         result[name] = trace(function, inputs, outputs)
     return result
 

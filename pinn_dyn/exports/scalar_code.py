@@ -207,8 +207,6 @@ class ScalarFunction:
             return self._product(*(self._of[x] for x in arguments))
         if name == "call":
             return self._called(node)
-        if name == "iterate":
-            return self._iterated(node)
         raise unsupported(node, "C code")
 
     def _operand(self, node: fx.Node, k: int) -> np.ndarray | None:
@@ -259,18 +257,10 @@ class ScalarFunction:
 
     def _called(self, node: fx.Node) -> np.ndarray:
         given: Any = node.args
-        function, size, sources = given
+        function, *sources, size = given
         arguments = tuple(tuple(self._of[x].ravel().tolist()) for x in sources)
-        call = self._terms.term("call", function, arguments, size)
+        call = self._terms.term("call", function, arguments, len(sources[1].meta["val"]), size)
         return np.array([self._terms.term("element", call, k) for k in range(size)], dtype=int)
-
-    def _iterated(self, node: fx.Node) -> np.ndarray:
-        given: Any = node.args
-        function, *sources = given
-        arguments = tuple(tuple(self._of[x].ravel().tolist()) for x in sources)
-        loop = self._terms.term("iterate", function, arguments, len(sources[1].meta["val"]))
-        size = len(arguments[0])
-        return np.array([self._terms.term("element", loop, k) for k in range(size)], dtype=int)
 
     # Statements.
 
@@ -288,8 +278,6 @@ class ScalarFunction:
                 continue
             if name == "call":
                 self._write_call(term, *rest)
-            elif name == "iterate":
-                self._write_loop(term, *rest)
             else:
                 self._texts[term] = self._written(term, uses[term] > 1, term in results)
         for name, terms in zip(names, ends, strict=True):
@@ -317,29 +305,27 @@ class ScalarFunction:
         return text if is_closed else f"({text})"
 
     def _write_call(
-        self, term: Term, function: str, arguments: Sequence[Sequence[Term]], size: int
+        self,
+        term: Term,
+        function: str,
+        arguments: Sequence[Sequence[Term]],
+        count: int,
+        size: int,
     ) -> None:
-        names = [f"t{term}_{k}" for k in range(len(arguments))]
-        for name, terms in zip(names, arguments, strict=True):
+        """Write y <- x, then y <- function(y, row) for each row."""
+        x, rows, result = f"t{term}_0", f"t{term}_1", f"t{term}"
+        for name, terms in zip((x, rows), arguments, strict=True):
             values = ", ".join(map(self._value, terms)) or "0"
-            self.lines.append(f"real {name}[] = {{{values}}};")
-        self.lines.append(f"real t{term}[{size}];")
-        names = [*self._constants.arguments, *names, f"t{term}"]
-        self.lines.append(f"{function}({', '.join(names)});")
-        self._texts[term] = f"t{term}"
-
-    def _write_loop(
-        self, term: Term, function: str, arguments: Sequence[Sequence[Term]], count: int
-    ) -> None:
-        names = [f"t{term}_{k}" for k in range(len(arguments))]
-        for name, terms in zip(names, arguments, strict=True):
-            values = ", ".join(map(self._value, terms))
-            self.lines.append(f"real {name}[{len(terms)}] = {{{values}}};")
-        x, rows = names
-        row = f"{rows} + {len(arguments[1]) // count} * k"
-        call = f"{function}({', '.join([*self._constants.arguments, x, row, x])})"
-        self.lines.append(f"for (int k = 0; k < {count}; k++) {call};")
-        self._texts[term] = x
+            self.lines.append(f"real {name}[{len(terms) or 1}] = {{{values}}};")
+        loop = ""
+        if count > 1:
+            loop, result = f"for (int k = 0; k < {count}; k++) ", x
+            rows += f" + {len(arguments[1]) // count} * k"
+        else:
+            self.lines.append(f"real {result}[{size}];")
+        names = [*self._constants.arguments, x, rows, result]
+        self.lines.append(f"{loop}{function}({', '.join(names)});")
+        self._texts[term] = result
 
     def _value(self, term: Term) -> str:
         return self._constants.spread(self._texts[term])
@@ -356,7 +342,7 @@ def _operands(entry: tuple[Any, ...]) -> Sequence[Term]:
         return ()
     if name == "element":
         return rest[:1]
-    return [*itertools.chain(*rest[1])] if name in ("call", "iterate") else rest
+    return [*itertools.chain(*rest[1])] if name == "call" else rest
 
 
 def _most_live(lines: Sequence[str]) -> int:

@@ -164,7 +164,7 @@ def test_new_numbers_count_in_the_next_path_and_build_nothing(monkeypatch, chang
     signal, x0 = Signal(t, torch.ones(20, 3).double()), torch.full((6,), 0.1).double()
     with torch.no_grad():
         before = copy.predict(x0, t, signal)
-        monkeypatch.setattr(c_loop, "trace", None)
+        monkeypatch.setattr(c_loop, "programs", None)
         monkeypatch.setattr(c_library, "compile_c", None)
         change(model)
         change(copy)
@@ -246,7 +246,7 @@ def test_the_stages_of_a_step_call_their_common_part():
     rolled_out(known_model())
     (code,) = codes()
     step = code.text[code.text.index("static void integration_step") :]
-    assert len(re.findall(r"\bpart\(", step)) == 4
+    assert len(re.findall(r"\bmass_and_bias\(", step)) == 4
 
 
 def next_states(monkeypatch, count=80):
@@ -263,7 +263,7 @@ def test_code_serves_the_next_process_also_with_other_numbers(monkeypatch, cache
     monkeypatch.setattr(c_library, "compile_c", None)
     monkeypatch.setattr(compiled, "BUILD_SECONDS", 1e6)
     with monkeypatch.context() as patch:
-        patch.setattr(c_loop, "trace", None)
+        patch.setattr(c_loop, "programs", None)
         assert next_states(monkeypatch, count=2) == 1
         next_process(monkeypatch)
         model = MODELS["momentum"]()
