@@ -235,6 +235,9 @@ def test_a_part_of_a_period_of_dead_time_takes_a_part_of_two_inputs(model):
     r = (q - model.observe(expected) - d) / model.std[:2]
     gain, _ = law.observer_gain(STEP)
     torch.testing.assert_close(moved, expected + gain[: 2 * n] @ r)
+    A, B = model.flow(0.7)  # of a period, until the next input acts
+    ahead = A @ x + B @ (model.latent_force(newer) - model.coupling_force(x[:n]))
+    torch.testing.assert_close(law._predicted(x, torch.stack([older, newer])), ahead)
 
 
 def test_a_dead_time_of_the_law_is_that_which_is_set(model):
