@@ -110,6 +110,8 @@ def comparison(entries: dict[str, Entry], folder: Path) -> pd.DataFrame:
             old = old[old["model"].str.endswith("learned")].assign(model="learned")
         tables = [pd.read_csv(path) for path in summaries(name, entry, folder) if path.is_file()]
         new = pd.concat(tables or [pd.DataFrame(columns=["model", "seed", metric])])
+        if "ensemble=true" in entry.get("evaluate", ""):
+            new = new[new["model"].str.startswith("mean of")]
         new = new.rename(columns={"controller": "model"}).dropna(subset=set(new) & {"seed"})
         if "control" not in entry and old["model"].nunique() == 1:  # laws keep their names
             new = new.assign(model=old["model"].iloc[0])

@@ -5,8 +5,7 @@ TensorBoard log that the app builds of a configuration, compiled. JAX is a loop 
 is jitted as one: it picks the batch by index, takes loss and gradient, clips by the global norm and
 moves the weights by AdamW (optax); or a scan of such steps, also jitted, whichever is faster. Both
 start from the same network, see the same batches, take the same schedule, and are first checked to
-end with the same weights. SOAP, which optax lacks, is timed alone. An ensemble (``--members``) is
-beside JAX's step under ``jax.vmap``.
+end with the same weights. SOAP, which optax lacks, is timed alone.
 
     python benchmarks/training_loop.py                              # all cells that the file lacks
     python benchmarks/training_loop.py --sizes 3 --batches 256      # some of them
@@ -42,7 +41,6 @@ from torch import Tensor
 
 from pinn_dyn.app.config import composed
 from pinn_dyn.data import DataSource, LightningData, Splits
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.run import build, trainer
@@ -55,7 +53,7 @@ EPOCH = trainer.LONGEST_EPOCH
 """Steps between two checkpoints of train.py."""
 CHECKED = 20
 """Steps after which the weights of both sides are compared."""
-CELL = ("coordinates", "batch", "loss", "optimizer", "members")
+CELL = ("coordinates", "batch", "loss", "optimizer")
 """What a row is of."""
 
 Row = dict[str, Any]
@@ -91,7 +89,7 @@ class Sines(DataSource):
 
 
 def configuration(
-    size: int, batch: int, loss: str, optimizer: str, members: int, device: str, compiled: bool
+    size: int, batch: int, loss: str, optimizer: str, device: str, compiled: bool
 ) -> dict[str, Any]:
     """That of a long training, of which the first epochs are run, up to no validation."""
     words = [
@@ -103,7 +101,6 @@ def configuration(
         "data.stride=1",
         f"data.pairs={PAIRS}",
         f"data.batch_size={batch}",
-        f"ensemble={members}",
         f"trainer.steps={STEPS_FOR_PROGRAM}",
         "trainer.validations=1",
         f"compile={str(compiled).lower()}",
@@ -162,7 +159,6 @@ def run_cell(
     batch: int,
     loss: str,
     optimizer: str,
-    members: int = 1,
     *,
     rounds: int,
     device: str = "cpu",
@@ -174,16 +170,14 @@ def run_cell(
     if steps is None:  # of an epoch, which ends with a checkpoint; fewer will do of large batches
         steps = EPOCH if batch <= 1024 else 40
     trainer.LONGEST_EPOCH = steps
-    config = configuration(size, batch, loss, optimizer, members, device, compiled)
+    config = configuration(size, batch, loss, optimizer, device, compiled)
     L.seed_everything(0, verbose=False)
     data = configured.build_data(config, Sines(size))
-    model = build.build_predictor(
-        build.model_builder(config), data.statistics, 0, config["ensemble"]
-    )
+    model = build.model_builder(config)(statistics=data.statistics)
     validator = configured.build_validator(config, data.statistics.step)
     learner = configured.build_learner(config, model, data.statistics, validator)
     windows = data.windows.to(torch.device("cpu"), torch.float32)
-    first = windows[next(batches(data, members))]
+    first = windows[next(batches(data))]
     if device == "gpu":
         first = first.to(torch.device("cuda"))
     clock = 0 if device == "cpu" else 1
@@ -196,10 +190,9 @@ def run_cell(
 
         scale = learner.loss.scale.numpy().reshape(-1)
         rates = schedule(config, learner)
-        models = [model.member(k) for k in range(members)] if members > 1 else [model]
-        loops = jax_loops.JaxLoops(models, windows, loss, scale, STEP, rates)
+        loops = jax_loops.JaxLoops([model], windows, loss, scale, STEP, rates)
         chosen, fastest = rival(loops, config, data, clock)
-        others["jax"] = lambda: fastest(islice(batches(data, members), steps))
+        others["jax"] = lambda: fastest(islice(batches(data), steps))
     turns = Turns(others, rounds)
     fit(config, data, learner, validator, turns)
     times = turns.times[1:]
@@ -207,7 +200,7 @@ def run_cell(
     def milliseconds(name: str, clock: int) -> float:
         return round(1e3 * statistics.median(turn[name][clock] for turn in times) / steps, 3)
 
-    row: Row = dict(zip(CELL, (size, batch, loss, optimizer, members), strict=True))
+    row: Row = dict(zip(CELL, (size, batch, loss, optimizer), strict=True))
     row |= {"ms": milliseconds("ours", 0), "wall_ms": milliseconds("ours", 1)}
     row["loss_and_gradient_ms"] = milliseconds("loss and gradient", clock)
     shares = [1 - turn["loss and gradient"][clock] / turn["ours"][clock] for turn in times]
@@ -226,7 +219,7 @@ def rival(loops: Any, config: dict[str, Any], data: Any, clock: int) -> tuple[st
     """The fastest loop of JAX, and its name: of two spellings, step by step or as a scan."""
 
     def first() -> Iterator[Tensor]:
-        return islice(batches(data, config["ensemble"]), CHECKED)
+        return islice(batches(data), CHECKED)
 
     def checked(make: Callable[[str], Loop], spelling: str) -> tuple[float, str, Loop]:
         run, name = make(spelling), f"{spelling}, {make.__name__}"
@@ -245,12 +238,9 @@ def rival(loops: Any, config: dict[str, Any], data: Any, clock: int) -> tuple[st
     return min(found, key=lambda item: item[0])[1:]
 
 
-def batches(data: Any, members: int) -> Iterator[Tensor]:
-    """Positions of an epoch's batches, ``(B,)``, or of each member's, ``(E, B)``."""
-    samplers = [LightningData(data).sampler(seed) for seed in range(members)]
-    if members == 1:
-        return iter(samplers[0])
-    return map(torch.stack, zip(*samplers, strict=True))
+def batches(data: Any) -> Iterator[Tensor]:
+    """Positions of an epoch's batches, ``(B,)``."""
+    return iter(LightningData(data).sampler(0))
 
 
 def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Callback) -> None:
@@ -259,8 +249,7 @@ def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Call
         place = Path(folder)
         lightning = configured.build_trainer(config, place)
         lightning.callbacks = [*callbacks, *lightning.callbacks]  # type: ignore[attr-defined]
-        members = config["ensemble"]
-        lightning.fit(learner, LightningData(data, members if members > 1 else None))
+        lightning.fit(learner, LightningData(data))
 
 
 def schedule(config: dict[str, Any], learner: Any) -> list[float]:
@@ -289,17 +278,13 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
     trainer.LONGEST_EPOCH, steps = CHECKED, trainer.LONGEST_EPOCH
     data = configured.build_data(config, data.source)
     L.seed_everything(0, verbose=False)
-    model = build.build_predictor(
-        build.model_builder(config), data.statistics, 0, config["ensemble"]
-    )
+    model = build.model_builder(config)(statistics=data.statistics)
     start = {name: p.detach().clone() for name, p in model.named_parameters()}
     validator = configured.build_validator(config, data.statistics.step)
     learner = configured.build_learner(config, model, data.statistics, validator)
     fit(config, data, learner, validator, Turns({}, 0))
     trainer.LONGEST_EPOCH = steps
-    prefix = model.prefix if isinstance(model, Ensemble) else ""
-    ours = dict(model.cpu().named_parameters())
-    theirs = {f"{prefix}{key}": value for key, value in named(tree).items()}
+    ours, theirs = dict(model.cpu().named_parameters()), named(tree)
     way = sum(float((ours[key].detach() - start[key]).square().sum()) for key in start)
     apart = sum(float((ours[key].detach() - x).square().sum()) for key, x in theirs.items())
     share = (apart / way) ** 0.5
@@ -354,7 +339,6 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--batches", type=int, nargs="+", default=[256, 1024, 8192])
     parser.add_argument("--losses", nargs="+", default=["increment", "midpoint"])
     parser.add_argument("--optimizers", nargs="+", default=["adamw", "soap"])
-    parser.add_argument("--members", type=int, nargs="+", default=[1], help="of an ensemble")
     parser.add_argument("--device", choices=["cpu", "gpu"], default="cpu")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, help="steps in a round")
@@ -371,8 +355,8 @@ def main(words: list[str] | None = None) -> None:
         os.environ["JAX_PLATFORMS"] = "cpu"
     torch.set_num_threads(1)
     if arguments.quick:
-        for optimizer, members in product(arguments.optimizers, arguments.members):
-            cell = (2, 32, "midpoint", optimizer, members)
+        for optimizer in arguments.optimizers:
+            cell = (2, 32, "midpoint", optimizer)
             print(run_cell(*cell, rounds=1, steps=20, compiled=False))
         return
     rows = rows_of(arguments.output)
@@ -381,8 +365,8 @@ def main(words: list[str] | None = None) -> None:
     if arguments.device == "gpu":
         record["hardware"] = torch.cuda.get_device_name()
     order = (arguments.optimizers, arguments.losses, arguments.sizes, arguments.batches)
-    for optimizer, loss, size, batch, members in product(*order, arguments.members):
-        cell = (size, batch, loss, optimizer, members)
+    for optimizer, loss, size, batch in product(*order):
+        cell = (size, batch, loss, optimizer)
         if tuple(map(str, cell)) in there:
             print(f"{', '.join(map(str, cell))}: is in {arguments.output}", flush=True)
             continue

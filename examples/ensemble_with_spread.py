@@ -1,4 +1,4 @@
-"""Several models of one log, trained at once: where they disagree, do not trust them.
+"""Several models of one log: where they disagree, do not trust them.
 
 python examples/ensemble_with_spread.py [--steps 300]
 """
@@ -13,13 +13,17 @@ import pinn_dyn
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--steps", type=int, default=1000, help="steps of the optimizer")
-parser.add_argument("--members", type=int, default=4)
+parser.add_argument("--seeds", type=int, default=4)
 args = parser.parse_args()
 
 log = pd.read_csv(Path(__file__).with_name("example_log.csv"))
 q = {"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]}
 u = {"columns": ["torque_x", "torque_y", "force"], "unit": ["Nm", "Nm", "N"]}
-ensemble = pinn_dyn.fit(log, q=q, u=u, run="run", steps=args.steps, ensemble=args.members)
+runs = [pinn_dyn.fit(log, q=q, u=u, run="run", steps=args.steps)]
+source = runs[0].source  # the other seeds have the same runs of the log for training
+for seed in range(1, args.seeds):
+    runs.append(pinn_dyn.train(source, "lnn", steps=args.steps, seed=seed))
+ensemble = pinn_dyn.ensemble(runs)
 print(ensemble)
 
 run = log[log.run == ensemble.source.test.names[0]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from torch import Tensor
 from pinn_dyn.control import DataRegion, Plant, SystemPlant
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation.prediction import model_for_rollouts
-from pinn_dyn.exports.c_draws import LoopOfDraws
 from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.exports.compiled import Function
 from pinn_dyn.exports.watch import Watch
@@ -36,8 +34,6 @@ Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
 """Reward of a step, from q and v after it, ``(N,)`` each, and the input ``(M,)``."""
 Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Rewards of K robots ``(K,)``, from q and v after a step, ``(K, N)`` each, and u ``(K, M)``."""
-
-log = logging.getLogger(__name__)
 
 _SAMPLES = 200  # states per trajectory
 
@@ -78,7 +74,6 @@ class ModelPlant(Plant):
         self._models = [model_for_rollouts(x) for x in self._originals]
         self._model = self._models[0]
         self._loop: Function | None = None
-        self._has_draws_in_c = True
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
         if self._watch.changed():
@@ -147,19 +142,10 @@ class ModelPlant(Plant):
         return q, v
 
     def _ready(self) -> Function | None:
-        if len(self._models) == 1:
-            integrator = cast(CLoop, self._model.integrator)
-            return integrator.ready(self._model, self._x, self._step)
-        if self._loop is not None or not self._has_draws_in_c:
-            return self._loop
-        stages, h = len(self._model.integrator.nodes), self._x.new_tensor(self._step)
-        inputs = self._x.new_zeros(stages, self.num_inputs)
-        try:
-            return LoopOfDraws(self._models, self._x[0], inputs, h)
-        except Exception:  # from a head that cannot be traced, a compiler or a full disk
-            log.info("no loop in C for draws of %s", type(self._model).__name__, exc_info=True)
-            self._has_draws_in_c = False
+        if len(self._models) > 1:
             return None
+        integrator = cast(CLoop, self._model.integrator)
+        return integrator.ready(self._model, self._x, self._step)
 
 
 class _Setup:

@@ -18,7 +18,6 @@ from pinn_dyn.app.config import checked
 from pinn_dyn.app.control_results import write_results
 from pinn_dyn.control import DataRegion, Guarded, Pipeline, Reference, Stage, export_law
 from pinn_dyn.data import DataSource, SimulationError
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
 from pinn_dyn.evaluation.learned_terms import term_conditions
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
@@ -177,10 +176,6 @@ def _thinned(values: Tensor) -> Tensor:
 
 def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem | CoupledOscillators:
     model = run.model
-    if isinstance(model, Ensemble):
-        model = model.member(config["member"])
-    elif config["member"]:
-        raise ConfigError(f"member is {config['member']}, but {run.folder} holds a single model")
     if isinstance(model, CoupledOscillators):
         return double_copy(model).requires_grad_(False)
     if not isinstance(model, MechanicalSystem):

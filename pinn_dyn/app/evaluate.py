@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -13,8 +14,11 @@ from pinn_dyn.app.config import checked
 from pinn_dyn.run.build import ConfigError, build_source
 from pinn_dyn.run.evaluation import evaluate
 from pinn_dyn.run.provenance import write_provenance
-from pinn_dyn.run.run_folder import CONFIG, load_run
+from pinn_dyn.run.run import Run, ensemble
+from pinn_dyn.run.run_folder import CONFIG, flattened, load_run
 from pinn_dyn.run.trust import packages
+
+_SEEDS = ("seed", "data.seed")
 
 
 def main(cfg: DictConfig) -> float:
@@ -45,6 +49,8 @@ def main(cfg: DictConfig) -> float:
     keys = ("split", "horizon", "step", "windows", "thresholds")
     try:
         source = build_source(config) if config.get("dataset") else None
+        if config["ensemble"]:
+            runs += _ensembles(runs)
         evaluation = evaluate(runs, source=source, **{key: config[key] for key in keys})
     except ValueError as error:
         raise ConfigError(str(error)) from error
@@ -57,3 +63,15 @@ def main(cfg: DictConfig) -> float:
         raise ConfigError(failure)
     summary = evaluation.summary
     return float(summary["error_mean"][~summary["baseline"]].min())
+
+
+def _ensembles(runs: Sequence[Run]) -> list[Run]:
+    """Return the mean of all runs that differ in their seeds alone, for each such group."""
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        settings = {k: x for k, x in flattened(run.config).items() if k not in _SEEDS}
+        groups.setdefault(repr(settings), []).append(run)
+    means = [ensemble(group) for group in groups.values() if len(group) > 1]
+    if not means:
+        raise ConfigError("ensemble: no two runs differ in the seed alone: add runs of other seeds")
+    return means

@@ -37,7 +37,6 @@ class TrainSettings:
     model_name: str
     seed: Seed
     compile: bool | Literal["auto"]
-    ensemble: PositiveInt = 1
     threads: PositiveInt
     start_from: str | None = None
     payload: Names | None = None
@@ -84,6 +83,7 @@ class _RunSettings:
 
     checkpoint: Literal["best", "last"]
     trajectory: NonNegativeInt
+    ensemble: bool
     threads: PositiveInt
     trust: Names | None = None
 
@@ -131,7 +131,6 @@ class ControlSettings(_RunSettings):
     """Keys of control.py."""
 
     run: str
-    member: NonNegativeInt
     gains: Gains | Mapping[str, Any]
     duration: PositiveFloat
     rate: PositiveFloat

@@ -100,7 +100,7 @@ def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
             else build_part(f"logger.{name}", part, save_dir=str(folder))
             for name, part in config["logger"].items()
         ],
-        **{name: config[name] for name in ("seed", "ensemble", "compile", "threads")},
+        **{name: config[name] for name in ("seed", "compile", "threads")},
     }
 
 

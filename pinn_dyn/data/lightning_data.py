@@ -7,19 +7,16 @@ import torch
 from torch.utils.data import DataLoader
 
 from pinn_dyn.data.datamodule import DynamicsData
-from pinn_dyn.data.windows import BatchSampler, MemberSampler, WindowLoader
+from pinn_dyn.data.windows import BatchSampler, WindowLoader
 from pinn_dyn.mechanics import Trajectory, stack_until
 
 
 class LightningData(L.LightningDataModule):
-    """Data module of Lightning for the windows and trajectories of :class:`DynamicsData`.
+    """Data module of Lightning for the windows and trajectories of :class:`DynamicsData`."""
 
-    With ``members``, batches ``(E, B)`` have the windows of member k in the order of ``seed + k``.
-    """
-
-    def __init__(self, data: DynamicsData, members: int | None = None):
+    def __init__(self, data: DynamicsData):
         super().__init__()
-        self.data, self.members = data, members
+        self.data = data
 
     def prepare_data(self) -> None:
         """Simulate or convert the data once, before other processes read them."""
@@ -41,11 +38,7 @@ class LightningData(L.LightningDataModule):
         """Return batches in single precision, from windows on the device that trains."""
         device = torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
         windows = self.data.windows.to(device, torch.float32)
-        seed = self.data.seed
-        if self.members is None:
-            return WindowLoader(windows, self.sampler(seed))
-        orders = [self.sampler(number) for number in range(seed, seed + self.members)]
-        return WindowLoader(windows, MemberSampler(orders))
+        return WindowLoader(windows, self.sampler(self.data.seed))
 
     def val_dataloader(self) -> DataLoader[Trajectory]:
         """Return one batch: all validation trajectories, up to the end of the shortest."""

@@ -245,7 +245,7 @@ class WindowLoader:
 
     Attributes:
         windows: all windows, on the device that trains.
-        sampler: positions of each batch, ``(B,)``, or ``(E, B)`` for the members of an ensemble.
+        sampler: positions of each batch, ``(B,)``.
     """
 
     windows: Windows
@@ -298,21 +298,3 @@ class BatchSampler(Sampler[Tensor]):
             order = torch.randperm(self.size, generator=generator)[: per_pass * self.batch_size]
             rows = order.view(per_pass, -1)[:, self.rank :: self.processes]
             yield from rows[: self.batches - first].unbind()
-
-
-class MemberSampler(Sampler[Tensor]):
-    """Sampler of batches ``(E, batch_size)`` from a sampler for each member."""
-
-    def __init__(self, samplers: list[BatchSampler]):
-        self.samplers = samplers
-
-    def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, as the trainer does at its start."""
-        for sampler in self.samplers:
-            sampler.set_epoch(epoch)
-
-    def __len__(self) -> int:
-        return len(self.samplers[0])
-
-    def __iter__(self) -> Iterator[Tensor]:
-        return map(torch.stack, zip(*self.samplers, strict=True))

@@ -129,13 +129,13 @@ def model_for_rollouts(
 ) -> Model:
     """Copy the model in float64, with loops in C for long rollouts on a CPU."""
     copy = double_copy(model, device)
-    members, inner = (1, copy.stack) if isinstance(copy, Ensemble) else (0, copy)
     if torch.device(device).type != "cpu":
         return copy
-    if isinstance(inner, ContinuousPredictor):
-        inner.integrator = CLoop(inner.integrator, members, threads)
-    elif isinstance(inner, EncodedPredictor):
-        LatentLoop(inner, threads).install()
+    for part in copy.members if isinstance(copy, Ensemble) else [copy]:
+        if isinstance(part, ContinuousPredictor):
+            part.integrator = CLoop(part.integrator, threads)
+        elif isinstance(part, EncodedPredictor):
+            LatentLoop(part, threads).install()
     return copy
 
 

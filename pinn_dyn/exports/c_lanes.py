@@ -89,7 +89,7 @@ void roll_out(double *values, long count, long steps, const double *start, const
     pack(increment, now, width, {size}, count - b);
     for (long k = 0; k < steps; k++) {{
       pack(u, inputs + b * length + k * {stages}, length, {stages}, count - b);
-      integration_step({values}, increment, x, u, lengths[k], next);
+      integration_step(values, increment, x, u, lengths[k], next);
       memcpy(increment, next, sizeof next);
       now += {size};
       unpack(now, increment, width, {size}, count - b);

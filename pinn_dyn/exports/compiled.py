@@ -212,7 +212,7 @@ class Compiled:
     def _code(self, programs: dict[str, Program], kind: Kind) -> Code:
         constants = [program.constants for program in programs.values()]
         every = torch.cat([x.evaluate() for x in constants])
-        numbers = LiveNumbers([*programs.values()], every[None])
+        numbers = LiveNumbers([*programs.values()], every)
         text = kind.text(programs, numbers)
         assert self._watch is not None
         addresses = {_identity(x): k for k, x in enumerate(self._watch.tensors)}

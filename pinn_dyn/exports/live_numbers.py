@@ -19,17 +19,14 @@ class LiveNumbers(ConstantArrays):
 
     Args:
         programs: the programs of the code.
-        numbers: all constants of the programs one after the other, of K models, ``(K, n)``.
+        numbers: all constants of the programs one after the other, ``(n,)``.
 
     Attributes:
         index: positions of the numbers that ``values`` holds in turn.
         fixed: number that the code contains, by its position.
-        read: expression of the array of numbers.
-        address: expression of its start for trajectory b, with a field for its length.
     """
 
     arguments = ("values",)
-    read, address = "values", "values"
 
     def __init__(self, programs: Sequence[Program], numbers: Tensor):
         super().__init__("double")
@@ -93,10 +90,9 @@ class LiveNumbers(ConstantArrays):
             self.fixed.update(zip(positions, values.flatten().double().tolist(), strict=True))
 
     def _fixed(self, position: int) -> float | None:
-        """Return the number at a position if it is 0, 1 or -1 in all models."""
-        column = self._numbers[:, position]
-        number = float(column[0])
-        if abs(number) not in (0.0, 1.0) or not bool((column == number).all()):
+        """Return the number at a position if it is 0, 1 or -1."""
+        number = float(self._numbers[position])
+        if abs(number) not in (0.0, 1.0):
             return None
         self.fixed[position] = number
         return number

@@ -10,12 +10,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-import torch
-
 from pinn_dyn.data import DataSource
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.models import Statistics
 from pinn_dyn.run.validation import ConfigError, check_value
 
 ModelBuilder = Callable[..., Predictor]
@@ -35,21 +31,6 @@ def model_builder(config: dict[str, Any]) -> ModelBuilder:
     if config["model"] is None:
         raise ConfigError("the model was built in Python: use pinn_dyn.load(folder, model=builder)")
     return build_part("model", config["model"], partial_=True)
-
-
-def build_predictor(
-    model: ModelBuilder | Predictor, statistics: Statistics, seed: int, ensemble: int = 1
-) -> Predictor:
-    """Build the model, or an ensemble of models of the seeds seed, seed + 1, ..."""
-    if isinstance(model, Predictor):
-        return model
-    if ensemble == 1:
-        return model(statistics=statistics)
-    members = []
-    for k in range(ensemble):
-        torch.manual_seed(seed + k)
-        members.append(model(statistics=statistics))
-    return Ensemble(members)
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.data import DataSource, LogSource, Splits, data_changes, data_identity
 from pinn_dyn.data.fastest_motion import too_long_for
+from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
@@ -150,10 +151,12 @@ def _require_comparable(
 
 
 def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
-    names, seeds = list(models), [f"seed {run.config['seed']}" for run in runs]
-    for suffixes in (seeds, [run.folder.name for run in runs]):
+    """Return the names of models, with the seed and the folder of single runs where needed."""
+    names, seeds = list(models), [f" seed {run.config['seed']}" for run in runs]
+    for suffixes in (seeds, [f" {run.folder.name}" for run in runs]):
         if len(set(names)) < len(names):
-            names = [f"{name} {suffix}" for name, suffix in zip(names, suffixes, strict=True)]
+            parts = zip(names, suffixes, runs, strict=True)
+            names = [x if isinstance(run.model, Ensemble) else x + y for x, y, run in parts]
     return names
 
 

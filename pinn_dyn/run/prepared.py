@@ -19,7 +19,7 @@ from pinn_dyn.evaluation.metrics import score
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
-from pinn_dyn.run.build import ConfigError, ModelBuilder, build_predictor, naming
+from pinn_dyn.run.build import ConfigError, ModelBuilder, naming
 from pinn_dyn.run.known_data import check_known, warn_of_log
 from pinn_dyn.run.provenance import provenance
 from pinn_dyn.run.run import TRAJECTORIES, Run
@@ -135,7 +135,7 @@ def prepare(
         rollouts = validator(training_step=statistics.step)
         rollouts.check(stack_until(windows.splits.validation), windows.splits.train)
     with naming("model"):
-        predictor = build_predictor(model, statistics, config["seed"], config["ensemble"])
+        predictor = model if isinstance(model, Predictor) else model(statistics=statistics)
         _check_windows(predictor, windows)
     known = predictor.known if isinstance(predictor, KnownAndNetwork) else predictor
     if isinstance(known, KnownMechanics):

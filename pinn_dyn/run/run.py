@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from pydantic import PositiveInt
 from torch import Tensor
 
-from pinn_dyn.data import DataSource, LogSource, RobotSource, store
+from pinn_dyn.data import DataSource, LogSource, RobotSource, data_changes, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.external_torque import ExternalTorque
@@ -33,7 +33,6 @@ from pinn_dyn.mechanics import (
     MechanicalSystem,
     Predictor,
     Signal,
-    double_copy,
 )
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
@@ -47,6 +46,7 @@ TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""
 
 Values = ArrayLike | Tensor
+_OF_ALL_MEMBERS = ("parameters", "training_seconds")  # metrics that add up
 
 
 class TermArrays(NamedTuple):
@@ -95,7 +95,7 @@ class Run:
 
     def __repr__(self) -> str:
         name, data = self.config["model_name"], self.config["dataset"].get("name")
-        members = f"{self.model.size} members, " if isinstance(self.model, Ensemble) else ""
+        members = f"{len(self.model.members)} members, " if isinstance(self.model, Ensemble) else ""
         return (
             f"Run({name} of {data}: {members}q = ({', '.join(self.labels)}), "
             f"u = ({', '.join(self.input_labels)}), validation error {score(self.metrics)})"
@@ -147,8 +147,8 @@ class Run:
         """The members of an ensemble as single models; a single model is its only member."""
         if not isinstance(self.model, Ensemble):
             return [self]
-        members = [double_copy(self.model.member(k)) for k in range(self.model.size)]
-        return [replace(self, model=member.requires_grad_(False)) for member in members]
+        members: Any = self.model.members
+        return [replace(self, model=member) for member in members]
 
     @property
     def ensemble(self) -> Ensemble | None:
@@ -399,7 +399,9 @@ class Run:
             TypeError: if the model is a single network, which has no spread.
         """
         if (ensemble := self.ensemble) is None:
-            raise TypeError("a single network has no spread: train an ensemble (ensemble=5)")
+            raise TypeError(
+                "a single network has no spread: train several seeds, and take ensemble(runs)"
+            )
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
             paths = model_for_rollouts(ensemble).member_increments(x0, times, signal)
@@ -527,6 +529,34 @@ class Run:
                 f"{symbol} = {size} for {', '.join(labels)}"
             )
         return tensor
+
+
+def ensemble(runs: Sequence[Run]) -> Run:
+    """Return the mean of several runs, such as those of a sweep over seeds, as a run::
+
+        run = pinn_dyn.ensemble([pinn_dyn.load(folder) for folder in folders])
+        low, high = run.predict_interval(start, u, t)
+
+    Its model is an :class:`~pinn_dyn.ensembles.Ensemble`, and its ``members`` are the runs.
+
+    Raises:
+        ValueError: if the runs have different data, or models that do not fit together.
+    """
+    first = runs[0]
+    for run in runs[1:]:
+        if changes := data_changes(first.data, run.data):
+            raise ValueError(
+                f"{run.folder} has other data than {first.folder}: {changes[0]}: the error on test "
+                "data of one is not that of the other, train all on the same data"
+            )
+    metrics = {x: sum(run.metrics.get(x, 0) for run in runs) for x in _OF_ALL_MEMBERS}
+    return replace(
+        first,
+        config={**first.config, "model_name": f"mean of {len(runs)} {first.config['model_name']}"},
+        model=Ensemble(run.model for run in runs),
+        metrics={**first.metrics, **metrics},
+        covariance=None,
+    )
 
 
 def _tensor(name: str, value: Values) -> Tensor:

@@ -22,7 +22,7 @@ from pinn_dyn.evaluation.tables import short
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import set_output_limits
-from pinn_dyn.run.build import ConfigError, ModelBuilder, build_predictor, model_builder
+from pinn_dyn.run.build import ConfigError, ModelBuilder, model_builder
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.trust import is_trusted, packages, require_trusted
 from pinn_dyn.systems import RigidChain
@@ -86,9 +86,7 @@ def load_run(
     try:
         statistics = Statistics.from_dict(saved["hyper_parameters"]["statistics"])
         with torch.random.fork_rng(devices=[]):  # models draw their initial weights
-            predictor = build_predictor(
-                model or model_builder(config), statistics, config["seed"], config["ensemble"]
-            )
+            predictor = (model or model_builder(config))(statistics=statistics)
         _load_weights(predictor, saved["state_dict"])
     except ValueError as error:
         version = record.get("pinn_dyn", __version__)
@@ -141,7 +139,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         config = _renamed(saved["hyper_parameters"]["config"])
         saved["hyper_parameters"]["config"] = config
-        config.setdefault("ensemble", 1)
+        if config.pop("ensemble", 1) > 1:
+            raise ValueError("several models in one file are of an earlier version, train again")
         config["dataset"].pop("cache", None)  # each user has their own
         config["model"] = _without_delay(config["model"])
         saved["state_dict"].items()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
@@ -21,7 +20,6 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.data import LightningData
 from pinn_dyn.data.simulation import has_cpp_compiler
-from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
 from pinn_dyn.evaluation.metrics import BEST_BY, error_text, validation_error
 from pinn_dyn.mechanics import Predictor
@@ -55,11 +53,9 @@ def build_learner(
 ) -> DynamicsLearner:
     """Build the LightningModule: model, loss, optimizer and schedule."""
     with naming("loss"):
-        single = model.member(0) if isinstance(model, Ensemble) else model
-        window_loss = loss(statistics=statistics, model=single)
-    learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
+        window_loss = loss(statistics=statistics, model=model)
     with naming("optimizer"):
-        return learner(
+        return DynamicsLearner(
             model,
             loss=window_loss,
             optimizer=optimizer,
@@ -293,11 +289,9 @@ def train_network(
         clipping=clipping,
     )
     trainer.callbacks.insert(0, Recorder(training))  # type: ignore[attr-defined]
-    data = LightningData(windows, model.size if isinstance(model, Ensemble) else None)
+    data = LightningData(windows)
     try:
-        # The optimizer of an ensemble is built inside of fit.
-        with naming("optimizer") if isinstance(model, Ensemble) else contextlib.nullcontext():
-            trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
+        trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
         if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
             trainer.validate(learner, data, verbose=False)
     except SystemExit as stop:  # Lightning's end of an interrupted training

@@ -91,7 +91,6 @@ def train(
     steps: PositiveInt | None = None,
     validations: PositiveInt | None = None,
     seed: int = 0,
-    ensemble: PositiveInt = 1,
     compile: bool | Literal["auto"] = "auto",
     threads: PositiveInt = 1,
     trainer: Mapping[str, Any] = MappingProxyType({}),
@@ -132,7 +131,6 @@ def train(
         steps: steps of the optimizer.
         validations: number of validations, a divisor of ``steps``.
         seed: seed of the weights and of the order of the windows.
-        ensemble: number of models trained at once, with the seeds seed, seed + 1, ...
         compile: compile the dynamics; ``"auto"`` does in long trainings if there is a compiler.
         threads: CPU threads; small networks are fastest with one.
         trainer: arguments of :class:`lightning.Trainer` beside the defaults; least squares uses
@@ -176,7 +174,7 @@ def train(
     made_in_python = config is None
     if config is None:
         parts = dict(data=data, loss=loss, optimizer=optimizer, scheduler=scheduler)
-        settings = dict(seed=seed, compile=compile, ensemble=ensemble, threads=threads)
+        settings = dict(seed=seed, compile=compile, threads=threads)
         start = {} if start_from is None else {"start_from": str(start_from.folder)}
         length = {"steps": steps, "validations": validations}
         config = _description(source, model, model_name, parts | {"validator": validator})

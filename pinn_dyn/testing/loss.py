@@ -8,10 +8,8 @@ import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.data import Windows
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, Signal
 from pinn_dyn.mechanics.compilation import Unrolled
-from pinn_dyn.mechanics.signal import stacked
 from pinn_dyn.models import LagrangianNetwork, NetworkCholesky, NetworkInput, NetworkPotential
 
 STEP = 0.02
@@ -72,17 +70,6 @@ class WindowLossContract:
         assert max(float(g.abs().max()) for g in gradients if g is not None) > 0
         alone = [loss(model, windows[torch.tensor([k])]) for k in range(6)]
         torch.testing.assert_close(value, torch.stack(alone).mean())
-
-    def test_stacked_members_have_their_own_losses(self, loss):
-        members = [small_model(seed) for seed in range(3)]
-        batches = [random_windows(4, seed) for seed in range(3)]
-        names = ("q", "v", "p", "dq", "dv", "dp")
-        rows = {name: torch.stack([getattr(batch, name) for batch in batches]) for name in names}
-        inputs = stacked([batch.input for batch in batches], batches[0].input.t)
-        losses = loss(Ensemble(members).stack, replace(batches[0], **rows, input=inputs))
-        alone = torch.stack([loss(m, batch) for m, batch in zip(members, batches, strict=True)])
-        torch.testing.assert_close(losses, alone, rtol=1e-10, atol=0)
-        assert len(set(alone.tolist())) == 3
 
     def test_loss_can_be_traced(self, loss, model):
         model.integrator = Unrolled(RK4())

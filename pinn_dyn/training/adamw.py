@@ -14,12 +14,12 @@ MOVED = 6
 
 
 def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> Tensor:
-    """Clip a gradient ``(*members, P)`` to the largest norm of each member, or value, if any."""
+    """Clip a gradient ``(P,)`` to the largest norm, or value, if any."""
     if largest is None:
         return gradient
     if by_value:
         return gradient.clamp(-largest, largest)
-    norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+    norm = torch.linalg.vector_norm(gradient)
     return gradient * (largest / (norm + 1e-6)).clamp(max=1.0)
 
 
@@ -31,7 +31,7 @@ class CompiledAdamW:
         m <- b1 m + (1 - b1) g      s <- b2 s + (1 - b2) g^2
         w <- (1 - lr d) w - lr / (1 - b1^k) m / (sqrt(s / (1 - b2^k)) + eps)
 
-    w: parameters, g: clipped gradient, m and s: moments, ``(*members, P)`` each; k: number of the
+    w: parameters, g: clipped gradient, m and s: moments, ``(P,)`` each; k: number of the
     step, b1 and b2: decay of the moments, d: weight decay. Source: Loshchilov and Hutter (2019),
     "Decoupled weight decay regularization".
 

@@ -92,11 +92,11 @@ class DynamicsLearner(L.LightningModule):
         self._losses: list[Tensor] = []  # losses of this epoch
         self._pace = math.inf  # time of a step, s
 
-    def gradients(self, vector: ParameterVector, steps: int) -> Engine:
-        """Return the engine that computes loss and gradient in a training of ``steps`` steps."""
+    def _engine(self) -> Engine:
+        """Return the engine that computes loss and gradient."""
         if self._compile and isinstance(self.model, ContinuousPredictor):
-            return Compiled(self.loss, self.model, vector, steps)
-        return Eager(self.loss, self.model, vector)
+            return Compiled(self.loss, self.model, self._vector, self._steps)
+        return Eager(self.loss, self.model, self._vector)
 
     def training_step(self, dataloader_iter: Iterator[tuple[Windows, int, int]]) -> None:
         """Take optimizer steps, one for each batch, until Lightning has something to do."""
@@ -137,15 +137,14 @@ class DynamicsLearner(L.LightningModule):
         if period and self.global_step % period == 0:
             losses = torch.stack(self._losses[-period:]).mean(0)
             reduce = trainer.strategy.reduce  # mean over processes
-            figures = {name: float(reduce(x)) for name, x in self.loss_figures(losses).items()}
+            figures = {"train/loss": float(reduce(losses))}
             for logger in trainer.loggers:
                 logger.log_metrics(figures, self.global_step - 1)
         if before + done >= trainer.num_training_batches:
             # The mean of the epoch, over the processes that share a batch.
-            means: Any = self.loss_figures(torch.stack(self._losses).mean(0))
-            self.log_dict(
-                means, logger=False, on_step=False, on_epoch=True, sync_dist=True, batch_size=1
-            )
+            mean = torch.stack(self._losses).mean()
+            how = {"on_step": False, "on_epoch": True, "sync_dist": True, "batch_size": 1}
+            self.log("train/loss", mean, logger=False, **how)  # type: ignore[arg-type]
 
     def _count_steps(self, done: int) -> None:
         """Count steps in the loop of Lightning, which has no public way to count several."""
@@ -203,16 +202,12 @@ class DynamicsLearner(L.LightningModule):
         return [losses]
 
     def _refuse_non_finite(self, losses: Tensor, first: int) -> None:
-        for step, loss in enumerate(losses.reshape(len(losses), -1).sum(1).tolist(), first):
+        for step, loss in enumerate(losses.tolist(), first):
             if not math.isfinite(loss):
                 raise NonFiniteLossError(
                     f"the training loss became {loss} at step {step} (epoch {self.current_epoch}): "
                     "reduce optimizer.lr, or use shorter windows (data.steps, data.stride)"
                 )
-
-    def loss_figures(self, losses: Tensor) -> dict[str, Tensor]:
-        """Return named figures of losses, ``()`` or one for each member of an ensemble."""
-        return {"train/loss": losses.mean()}
 
     @property
     def latest_loss(self) -> float:
@@ -235,25 +230,12 @@ class DynamicsLearner(L.LightningModule):
         model = copy.deepcopy(self.model)
         model.load_state_dict({name.removeprefix("model."): x for name, x in weights.items()})
         q = self.trainer.datamodule.data.windows.q  # type: ignore[attr-defined]
-        limits = self.output_limits(model, q.to(next(model.parameters())))
+        limits = output_limits(model, q.to(next(model.parameters())))
         weights.update({f"model.{name}": limit for name, limit in limits.items()})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Remove the output limits for further training."""
         checkpoint["state_dict"] = free_weights(checkpoint["state_dict"])
-
-    def output_limits(self, model: Predictor, q: Tensor) -> dict[str, Tensor]:
-        """Return the output limits of the heads of a model at q ``(K, N)``."""
-        return output_limits(model, q)
-
-    def parameter_vector(self) -> ParameterVector:
-        """Return the parameters of the model as one vector."""
-        return ParameterVector(self.model.parameters())
-
-    def built_optimizer(self, vector: ParameterVector) -> Optimizer:
-        """Build the optimizer, on a single vector if it treats every number separately."""
-        optimizer = self._optimizer(vector.parameters)
-        return self._optimizer([vector.values]) if type(optimizer) in ELEMENTWISE else optimizer
 
     def configure_optimizers(self) -> Any:
         """Build the optimizer and the schedule, and the programs, in the training process."""
@@ -262,9 +244,11 @@ class DynamicsLearner(L.LightningModule):
                 f"trainer.precision {self.trainer.precision} scales the loss: use bf16-mixed or 32"
             )
         self._steps = int(self.trainer.estimated_stepping_batches)
-        self._vector = self.parameter_vector()
-        self._gradients = self.gradients(self._vector, self._steps)
-        optimizer = self.built_optimizer(self._vector)
+        self._vector = ParameterVector(self.model.parameters())
+        self._gradients = self._engine()
+        optimizer = self._optimizer(self._vector.parameters)
+        if type(optimizer) in ELEMENTWISE:  # which treat every number separately
+            optimizer = self._optimizer([self._vector.values])
         scheduler = self._scheduler(optimizer, total_steps=self._steps)
         compiled = isinstance(self._gradients, Compiled) and self.trainer.world_size == 1
         if compiled and self.device.type == "cpu" and CompiledAdamW.supports(optimizer):

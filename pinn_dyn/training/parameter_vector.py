@@ -16,21 +16,18 @@ class ParameterVector:
     """The parameters of a model and their gradients as views of two vectors.
 
     Args:
-        parameters: parameters of one model, or stacked over E members, ``(E, ...)``.
-        members: E, or None for a single model.
+        parameters: the parameters.
 
     Attributes:
         parameters: the parameters.
-        values: all numbers of the parameters, ``(P,)`` or ``(E, P)``, with all gradients.
+        values: all numbers of the parameters, ``(P,)``, with all gradients.
     """
 
-    def __init__(self, parameters: Iterable[nn.Parameter], members: int | None = None):
+    def __init__(self, parameters: Iterable[nn.Parameter]):
         self.parameters = list(parameters)
-        leading = () if members is None else (members,)
-        self._shapes = [p.shape[len(leading) :] for p in self.parameters]
+        self._shapes = [p.shape for p in self.parameters]
         self._sizes = [shape.numel() for shape in self._shapes]
-        rows = [p.detach().reshape(*leading, -1) for p in self.parameters]
-        self.values = nn.Parameter(torch.cat(rows, dim=-1))
+        self.values = nn.Parameter(torch.cat([p.detach().flatten() for p in self.parameters]))
         self.gradient = torch.zeros_like(self.values)
         self.values.grad = self.gradient
         for parameter, value in zip(self.parameters, self.split(self.values.detach()), strict=True):
@@ -44,20 +41,15 @@ class ParameterVector:
             parameter.grad = gradient
 
     def split(self, vector: Tensor) -> list[Tensor]:
-        """Split a vector ``(..., P)`` into views of the parameters' shapes, ``(..., *shape)``."""
-        parts = vector.split(self._sizes, dim=-1)
-        pairs = zip(parts, self._shapes, strict=True)
-        return [part.view((*part.shape[:-1], *shape)) for part, shape in pairs]
+        """Split a vector ``(P,)`` into views of the shapes of the parameters."""
+        parts = zip(vector.split(self._sizes), self._shapes, strict=True)
+        return [part.view(shape) for part, shape in parts]
 
-    def joined(self, gradients: Sequence[Tensor | None], leading: tuple[int, ...] = ()) -> Tensor:
-        """Join gradients ``(*leading, *shape)``, with None for zero, to ``(*leading, P)``."""
-        rows = [
-            self.values.new_zeros(*leading, n) if value is None else value.reshape(*leading, n)
-            for value, n in zip(gradients, self._sizes, strict=True)
-        ]
-        return torch.cat(rows, dim=-1)
+    def joined(self, gradients: Sequence[Tensor | None]) -> Tensor:
+        """Join gradients of the shapes of the parameters, with None for zero, to ``(P,)``."""
+        pairs = zip(gradients, self._sizes, strict=True)
+        return torch.cat([self.values.new_zeros(n) if x is None else x.flatten() for x, n in pairs])
 
     def gradient_of(self, loss: Tensor) -> Tensor:
-        """Return the gradient of a loss by autograd, in the shape of ``values``."""
-        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
-        return self.joined(gradients, tuple(self.values.shape[:-1]))
+        """Return the gradient of a loss by autograd, ``(P,)``."""
+        return self.joined(torch.autograd.grad(loss, self.parameters, allow_unused=True))

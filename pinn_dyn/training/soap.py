@@ -39,9 +39,6 @@ class SOAP(Optimizer):
         eps: added to the root of the second moments.
     """
 
-    leading = 0
-    """Number of dimensions of a parameter before those of its matrix."""
-
     def __init__(
         self,
         params: Iterable[nn.Parameter] | Iterable[dict[str, Any]],
@@ -69,7 +66,7 @@ class SOAP(Optimizer):
 
     def _move(self, number: int, group: dict[str, Any], moved: list[Tensor]) -> None:
         if number not in self._layouts:
-            self._layouts[number] = _Layout(moved, self.leading)
+            self._layouts[number] = _Layout(moved)
         layout = self._layouts[number]
         beta1, beta2 = group["betas"]
         gradient = layout.laid_out([p.grad for p in moved])  # type: ignore[misc]
@@ -153,20 +150,19 @@ class _Batch:
 class _Layout:
     """Positions of the numbers of all parameters in a vector: batches of matrices, then vectors."""
 
-    def __init__(self, parameters: list[Tensor], leading: int):
+    def __init__(self, parameters: list[Tensor]):
         device = parameters[0].device
         sizes = [p.numel() for p in parameters]
         total = sum(sizes)
         by_size: dict[tuple[int, int], list[Tensor]] = {}
         vectors = []
         for p, numbers in zip(parameters, torch.arange(total).split(sizes), strict=True):
-            if p.ndim < leading + 2:
+            if p.ndim < 2:
                 vectors.append(numbers)
                 continue
-            rows, columns = p.shape[leading], p.shape[leading + 1 :].numel()
-            matrices = numbers.view(-1, rows, columns)
+            rows, columns = p.shape[0], p.shape[1:].numel()
             padded = _padded(rows), _padded(columns)
-            by_size.setdefault(padded, []).extend(matrices)
+            by_size.setdefault(padded, []).append(numbers.view(rows, columns))
         self.batches: list[_Batch] = []
         positions: list[Tensor] = []  # in the parameters; the last one is a zero
         start = 0

@@ -60,7 +60,6 @@ RUNS = {
     "mlp": ["model=mlp"],
     "other seed": ["model=lnn", "seed=1"],
     "oscillators": ["model=oscillators", "data.steps=5", "data.history=0"],
-    "ensemble": ["model=lnn", "ensemble=3"],
 }
 """Arguments of the runs that all tests share; a test that changes a run takes a copy."""
 

@@ -36,10 +36,6 @@ COMMANDS = {
     ],
     "least squares of a network": ["train.py", *TINY, "model=lnn", "optimizer=least_squares"],
     "inputs in ampere": ["train.py", *KNOWN, "dataset.u.unit=A"],
-    "optimizer that mixes members": [
-        *("train.py", *TINY, "model=lnn", "ensemble=2", "optimizer=soap"),
-        "optimizer._target_=torch.optim.Adafactor",
-    ],
     "memory without history": ["train.py", *LOG, "model=subnet", "data.history=0.01"],
     "no compiler": ["train.py", *TINY, "model=mlp", "compile=true"],
     "option of a group": ["train.py", *TINY, "model=lnn", "model.damping=constant"],

@@ -213,7 +213,6 @@ def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
         (["+robot.mass=-1"], ["robot", "mass", "-1"]),
         (["rate=null"], ["rate", "20000"]),
         (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
-        (["member=1"], ["member is 1", "a single model"]),
         (["checkpoint=first"], ["first", "'best' or 'last'"]),
     ],
     ids=lambda value: value[0] if isinstance(value[0], str) else None,

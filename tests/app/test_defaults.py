@@ -38,7 +38,7 @@ STRUCTURES = {
     "known_and_network": [f"model.known.structure.urdf={ARM}"],
 }
 LEAST_SQUARES = ("known", "known_system")
-COMPARED = ("seed", "compile", "ensemble", "threads", "trainer", "model")
+COMPARED = ("seed", "compile", "threads", "trainer", "model")
 COMPARED += ("data", "loss", "optimizer", "scheduler", "validator")
 
 

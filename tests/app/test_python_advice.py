@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 import pinn_dyn
-from pinn_dyn.app.config import composed
 from pinn_dyn.data.logs import LogError, LogSource
 from pinn_dyn.run.run_folder import load_run, require_no_links_out
 from pinn_dyn.run.validation import ConfigError
@@ -140,11 +139,11 @@ def test_runs_of_different_data_are_evaluated_separately_or_on_one_data_set(
 def test_an_ensemble_has_the_interval_that_a_single_network_has_not(lnn_run, run_of):
     start, t = np.array([0.0, 0, 0.2, 0, 0, 0]), np.arange(20) * 0.002
     u = np.zeros((20, 3))
-    with pytest.raises(TypeError, match="train an ensemble") as error:
+    with pytest.raises(TypeError, match="train several seeds") as error:
         pinn_dyn.load(lnn_run).predict_interval(start, u, t)
-    option = re.search(r"\((ensemble=\d+)\)", str(error.value))[1]
-    assert composed("train", ["model_name=lnn", option])["ensemble"] > 1
-    run = pinn_dyn.load(run_of("ensemble"))
+    call = re.search(r"take (ensemble\(runs\))", str(error.value))[1]
+    runs = [pinn_dyn.load(folder) for folder in (lnn_run, run_of("other seed"))]
+    run = eval(f"pinn_dyn.{call}", {"pinn_dyn": pinn_dyn, "runs": runs})
     low, high = run.predict_interval(start, u, t)
     assert (low < high)[1:].any()
     with pytest.raises(TypeError, match="expected predict") as error:

@@ -15,7 +15,7 @@ def test_batches_depend_on_the_seed_and_the_epoch_alone():
     assert torch.equal(batches(epoch=3), batches(epoch=3))
     assert not torch.equal(batches(epoch=3), batches(epoch=4))
     assert not torch.equal(batches(seed=0), batches(seed=1))
-    # The members of an ensemble have seeds in a row.
+    # Sweeps have seeds in a row.
     assert not torch.equal(batches(seed=0, epoch=1), batches(seed=1, epoch=0))
     # A sampler that has been through earlier epochs gives what a fresh one gives.
     sampler = BatchSampler(64, batch_size=16, batches=4, seed=0)

@@ -43,7 +43,7 @@ def test_all_draws_explain_the_data_and_all_bodies_can_exist(fitted):
     scale = expected.std(0)
     spread, naive = (
         (torch.stack([x.inverse_dynamics(*at) for x in models]) - expected) / scale
-        for models in (draws, map(posterior_draws(model, covariance, 20).member, range(20)))
+        for models in (draws, posterior_draws(model, covariance, 20).members)
     )
     slopes = model.slopes().by_parameters(*at, 0 * at[0])
     linear = torch.einsum("knp,pr,knr->kn", slopes, covariance, slopes) / scale**2

@@ -186,7 +186,7 @@ def test_train_policy(home):
 
 
 def test_ensemble_with_spread():
-    lines = run("ensemble_with_spread.py", "--members", "2", "--steps", "2").splitlines()
+    lines = run("ensemble_with_spread.py", "--seeds", "2", "--steps", "2").splitlines()
     head = next(k for k, line in enumerate(lines) if line.split() == ["t", "error", "spread"])
     assert float(lines[head + 1].split()[2]) < float(lines[-1].split()[2])  # common start
 

@@ -21,7 +21,7 @@ from pinn_dyn.models import Servo
 from pinn_dyn.testing import LinearSystem
 from tests.models.builders import VARIANTS, make_model, make_structured, perturb
 from tests.support.arm_urdf import ARM
-from tests.support.code_in_c import build_at_once, codes, next_process
+from tests.support.code_in_c import build_at_once, codes, loop_of, next_process
 from tests.support.known import elastic_model, known_model
 
 NETWORK = VARIANTS["constant-mass-fixed-damping-constant-input-3x3"]
@@ -134,6 +134,16 @@ def test_long_paths_are_computed_in_blocks_and_end_where_one_diverges(monkeypatc
     same = found.isfinite() == expected.isfinite()
     assert same.all()
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=0, equal_nan=True)
+
+
+def test_code_that_is_wrong_under_inputs_alone_is_refused():
+    model = MODELS["momentum"]().double().requires_grad_(False)
+    x = torch.zeros(1, 2 * model.num_coordinates).double()
+    u = torch.zeros(1, 2, 4, model.num_inputs).double()
+    steps = c_loop.Steps(model, x, u, torch.full((2,), 0.01).double())
+    loop = loop_of(model, x[0], u[0, 0], torch.tensor(0.01).double(), several=False)
+    assert steps.agrees(loop)
+    assert not steps.agrees(lambda increment, x, u, h: loop(increment, x, 2 * u, h))
 
 
 def changed_by_data(model):

@@ -6,7 +6,7 @@ import torch
 
 from pinn_dyn.exports import compiled
 from pinn_dyn.exports.c_library import QUICK, load_code
-from pinn_dyn.exports.c_loop import Loop, loop_code, traced
+from pinn_dyn.exports.c_loop import SEVERAL_FROM, Loop, Steps
 from pinn_dyn.exports.live_numbers import LiveNumbers
 
 
@@ -31,8 +31,10 @@ def codes():
 
 def loop_of(model, x, inputs, h, several):
     """Return the loop of a model without a cache of its numbers."""
-    programs = traced(model, x, inputs, h)
+    count = SEVERAL_FROM if several else 1
+    steps = Steps(model, x.expand(count, -1), inputs.expand(count, 1, *inputs.shape), h[None])
+    programs = steps.programs()
     constants = torch.cat([program.constants.evaluate() for program in programs.values()])
-    numbers = LiveNumbers([*programs.values()], constants[None])
-    library = load_code(loop_code(programs, numbers, several), QUICK)
+    numbers = LiveNumbers([*programs.values()], constants)
+    library = load_code(steps.text(programs, numbers), QUICK)
     return Loop(library, torch.cat([constants[numbers.index], torch.zeros(1)]))

@@ -1,12 +1,11 @@
 """Random windows of one step, and the scales that go with them."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import torch
 
 from pinn_dyn.data import Windows
 from pinn_dyn.mechanics import Signal
-from pinn_dyn.mechanics.signal import stacked
 from tests.models.builders import STEP, make_statistics
 
 
@@ -43,14 +42,3 @@ def one_step(size=1):
         qv_increment_std=scales.qv_increment_std[:1],
         qp_increment_std=scales.qp_increment_std[:1],
     )
-
-
-def for_members(batches):
-    """Windows ``(E, B, ...)``, a batch for each member of an ensemble."""
-    first = batches[0]
-    rows = {
-        item.name: torch.stack([getattr(batch, item.name) for batch in batches])
-        for item in fields(Windows)
-        if item.name not in ("t", "input", "past")
-    }
-    return replace(first, **rows, input=stacked([batch.input for batch in batches], first.input.t))

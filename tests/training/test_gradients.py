@@ -7,8 +7,6 @@ from functools import partial
 import pytest
 import torch
 
-from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.ensembles.gradients import CompiledMembers
 from pinn_dyn.mechanics import RK4, Rosenbrock
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.models import (
@@ -17,14 +15,13 @@ from pinn_dyn.models import (
     ConstantInput,
     LagrangianNetwork,
     LearnedVelocity,
-    NetworkCholesky,
     NetworkPotential,
 )
 from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager
 from pinn_dyn.training.gradients.program import LossProgram
 from tests.models.builders import make_model, make_structured, perturb
-from tests.support.windows import for_members, make_windows, one_step, spread_out
+from tests.support.windows import make_windows, one_step, spread_out
 
 
 def engine(kind, loss, model, *steps):
@@ -137,41 +134,6 @@ def test_an_experimental_option_of_the_compiler_cannot_end_a_training(monkeypatc
     program = LossProgram(loss, model, ParameterVector(model.parameters()))
     assert_same(program(windows, part=4), engine(Eager, loss, model)(windows))
     assert tried == ([True, False] if size == 1 else [False])
-
-
-@pytest.mark.parametrize(
-    ("threads", "built"), [(1, False), pytest.param(2, True, marks=pytest.mark.slow)]
-)
-def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(
-    request, monkeypatch, threads, built
-):
-    """Even in a short training: one program serves all members."""
-    if not built:
-        request.getfixturevalue("traced")
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    members = [perturb(AccelerationMLP(one_step(), hidden=[6]).double(), seed=k) for k in range(3)]
-    stack = Ensemble(members).stack
-    loss = IncrementLoss(one_step(), members[0]).double()
-    compiled = CompiledMembers(loss, stack, ParameterVector(stack.parameters(), members=3))
-    batches = [make_windows(6, seed=k) for k in range(3)]
-    losses, gradients = compiled(for_members(batches))
-    assert len(compiled._program._programs) == 1
-    for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
-        assert_same((losses[k], gradients[k]), engine(Eager, loss, member)(batch))
-
-
-@pytest.mark.slow
-def test_a_program_of_all_members_has_the_same(traced):
-    """It is what a GPU takes."""
-    mass = partial(NetworkCholesky, hidden=[3])
-    members = [perturb(SMALL_LNN(n=2, m=2, mass=mass), seed=k) for k in range(3)]
-    stack = Ensemble(members).stack
-    loss = IncrementLoss(one_step(size=2), members[0]).double()
-    program = LossProgram(loss, stack, ParameterVector(stack.parameters(), members=3))
-    batches = [make_windows(6, size=2, seed=k) for k in range(3)]
-    losses, gradients = program(for_members(batches), part=3)
-    for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
-        assert_same((losses[k], gradients[k]), engine(Eager, loss, member)(batch))
 
 
 @pytest.mark.parametrize("case", ["short training", "two steps"])

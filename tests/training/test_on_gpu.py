@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from pinn_dyn.data import LightningData
-from pinn_dyn.ensembles import Ensemble, EnsembleLearner
-from pinn_dyn.ensembles.gradients import CompiledMembers
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.mechanics import Signal, double_copy
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
@@ -20,8 +18,8 @@ from pinn_dyn.training import (
 )
 from pinn_dyn.training.gradients import Compiled, Eager
 from tests.models.builders import make_model, perturb
-from tests.support.ensembles import learn, make_data, make_models, train
-from tests.support.windows import for_members, make_windows, one_step
+from tests.support.small_trainings import learn, make_data, make_models, train
+from tests.support.windows import make_windows, one_step
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
 GPU = torch.device("cuda")
@@ -57,21 +55,6 @@ def test_a_recorded_program_gives_the_loss_and_gradient_of_the_eager_model_on_a_
         assert all(map(torch.equal, found, at_once))
 
 
-def test_one_program_gives_all_members_their_losses_and_gradients():
-    members = [perturb(make_model("lnn"), seed=k) for k in range(3)]
-    loss = IncrementLoss(one_step(size=2), members[0]).double()
-    stack = Ensemble(members).stack.to(GPU)
-    vector = ParameterVector(stack.parameters(), members=3)
-    compiled = CompiledMembers(copy.deepcopy(loss).to(GPU), stack, vector)
-    batches = batches_of(6)
-    losses, gradients = compiled(for_members(batches).to(GPU))
-    assert len(compiled._program._programs) == 1
-    for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
-        expected = Eager(loss, member, ParameterVector(member.parameters()))(batch)
-        torch.testing.assert_close(losses[k].cpu(), expected[0], rtol=1e-9, atol=0)
-        torch.testing.assert_close(gradients[k].cpu(), expected[1], rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("compile", [False, True])
 @pytest.mark.parametrize("kind", ["lnn", "hnn", "next state"])
 def test_a_training_ends_with_the_weights_that_it_has_on_a_cpu(tmp_path, kind, compile):
@@ -86,20 +69,6 @@ def test_a_training_ends_with_the_weights_that_it_has_on_a_cpu(tmp_path, kind, c
         ends.append([p.detach().cpu() for p in model.parameters()])
     for found, expected in zip(*ends, strict=True):
         # Adam divides by the size of a gradient: rounding counts where that is near zero.
-        torch.testing.assert_close(found, expected, rtol=1e-3, atol=2e-4)
-
-
-def test_members_end_with_the_weights_that_they_have_on_a_cpu(tmp_path):
-    ends = []
-    for accelerator in ("cpu", "gpu"):
-        data = make_data()
-        models = make_models("lnn", data, 2)
-        ensemble = Ensemble(models)
-        compiled = accelerator == "gpu"
-        learner = learn(EnsembleLearner, ensemble, models[0], data, compile=compiled)
-        train(tmp_path, learner, LightningData(data, 2), accelerator=accelerator)
-        ends.append([p.detach().cpu() for p in ensemble.parameters()])
-    for found, expected in zip(*ends, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=2e-4)
 
 

@@ -2,27 +2,24 @@
 
 import copy
 
-import pytest
 import torch
 from pytorch_optimizer import SOAP as Library
 
-from pinn_dyn.ensembles.learner import MemberSOAP
 from pinn_dyn.training import SOAP
 
 SHAPES = [(5, 5), (3, 7), (6, 2), (1, 4), (40, 3), (2, 33), (6,), ()]
 SETTINGS = {"lr": 0.01, "weight_decay": 0.1, "precondition_frequency": 4}
-MEMBERS = 3
 
 
-def parameters(leading=()):
+def parameters():
     generator = torch.Generator().manual_seed(0)
     options = dict(generator=generator, dtype=torch.float64)
-    return [torch.nn.Parameter(torch.randn((*leading, *shape), **options)) for shape in SHAPES]
+    return [torch.nn.Parameter(torch.randn(shape, **options)) for shape in SHAPES]
 
 
-def one_by_one(stacked):
-    """The parameters of each member, in the order of the stacked ones."""
-    return [torch.nn.Parameter(row.detach().clone()) for value in stacked for row in value]
+def copies(parameters):
+    """The same parameters for another optimizer."""
+    return [torch.nn.Parameter(p.detach().clone()) for p in parameters]
 
 
 def steps(several, alone, optimizers, count, seed):
@@ -31,9 +28,8 @@ def steps(several, alone, optimizers, count, seed):
     for _ in range(count):
         for parameter in several:
             parameter.grad = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
-        rows = [row for parameter in several for row in parameter.grad.view(len(alone) // 8, -1)]
-        for parameter, row in zip(alone, rows, strict=True):
-            parameter.grad = row.view(parameter.shape).clone()
+        for parameter, other in zip(several, alone, strict=True):
+            other.grad = parameter.grad.clone()
         for optimizer in optimizers:
             optimizer.step()
 
@@ -51,21 +47,17 @@ def take_bases(ours, several, theirs, alone):
             theirs.state[parameter]["Q"] = of_size[tuple(parameter.shape)].pop(0)
 
 
-@pytest.mark.parametrize(
-    ("kind", "leading"), [(SOAP, ()), (MemberSOAP, (MEMBERS,))], ids=["one model", "members"]
-)
-def test_every_matrix_moves_as_it_does_alone(kind, leading):
+def test_every_matrix_moves_as_it_does_alone():
     """The bases are turned three times, each time after gradients along every direction."""
-    several = parameters(leading)
-    alone = one_by_one(several if leading else [p[None] for p in several])
+    several = parameters()
+    alone = copies(several)
     settings = {**SETTINGS, "precondition_frequency": 20}
-    ours, theirs = kind(several, **settings), Library(alone, **settings)
+    ours, theirs = SOAP(several, **settings), Library(alone, **settings)
     steps(several, alone, [ours, theirs], 1, seed=1)
     take_bases(ours, several, theirs, alone)
     start = [p.detach().clone() for p in several]
     steps(several, alone, [ours, theirs], 65, seed=2)
-    rows = [row for value in several for row in (value if leading else value[None])]
-    for found, expected in zip(rows, alone, strict=True):
+    for found, expected in zip(several, alone, strict=True):
         # The library decomposes in float32.
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
     for before, after in zip(start, several, strict=True):
@@ -75,7 +67,7 @@ def test_every_matrix_moves_as_it_does_alone(kind, leading):
 def test_the_zeros_that_fill_a_matrix_up_stay_zeros():
     several = parameters()
     optimizer = SOAP(several, **SETTINGS)
-    steps(several, one_by_one([p[None] for p in several]), [optimizer], 13, seed=1)
+    steps(several, copies(several), [optimizer], 13, seed=1)
     state = optimizer.state[several[0]]
     filled = 0
     for batch, bases in zip(optimizer._layouts[0].batches, state["bases"], strict=True):
@@ -90,7 +82,7 @@ def test_the_zeros_that_fill_a_matrix_up_stay_zeros():
 def test_a_training_goes_on_from_its_saved_state():
     """The same steps in one go, and with the optimizer written and read half way."""
     whole, halves = parameters(), parameters()
-    alone = one_by_one([p[None] for p in whole])
+    alone = copies(whole)
     optimizer, first = SOAP(whole, **SETTINGS), SOAP(halves, **SETTINGS)
     steps(whole, alone, [optimizer], 6, seed=1)
     steps(whole, alone, [optimizer], 6, seed=2)

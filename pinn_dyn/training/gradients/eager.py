@@ -12,8 +12,7 @@ from pinn_dyn.training.losses import WindowLoss
 from pinn_dyn.training.parameter_vector import ParameterVector
 
 Engine = Callable[[Windows], tuple[Tensor, Tensor]]
-"""Function from windows to the loss ``()`` and its gradient ``(P,)``, or to the losses ``(E,)`` and
-gradients ``(E, P)`` of an ensemble."""
+"""Function from windows to the loss ``()`` and its gradient ``(P,)``."""
 
 
 class Eager:
@@ -23,5 +22,5 @@ class Eager:
         self.loss, self.model, self.vector = loss, model, vector
 
     def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        losses = self.loss(self.model, windows)
-        return losses.detach(), self.vector.gradient_of(losses.sum())
+        loss = self.loss(self.model, windows)
+        return loss.detach(), self.vector.gradient_of(loss)

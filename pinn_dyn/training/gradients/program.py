@@ -41,20 +41,13 @@ class LossProgram:
     def __call__(self, windows: Windows, part: int) -> tuple[Tensor, Tensor]:
         """Return loss and gradient, computed in parts of at least ``part`` windows."""
         parts = windows.split(part)
-        results = self.in_parallel([self._vector.values.detach()] * len(parts), parts)
-        return weighted_sum([len(part) / len(windows) for part in parts], results)
-
-    def in_parallel(
-        self, values: Iterable[Tensor], batches: list[Windows]
-    ) -> Iterable[list[Tensor]]:
-        """Return loss and gradient of each batch at its parameter values ``(P,)``."""
-        arguments = [
-            (value, *self._rows(batch)) for value, batch in zip(values, batches, strict=True)
-        ]
+        arguments = [(self._vector.values.detach(), *self._rows(x)) for x in parts]
         # Compile before the threads call the program.
-        pairs = zip(batches, arguments, strict=True)
-        programs = [self._program(self._traced(batch), batch, rows) for batch, rows in pairs]
-        return self._run(programs, arguments)
+        pairs = zip(parts, arguments, strict=True)
+        programs = [self._program(self._traced(x), x, rows) for x, rows in pairs]
+        run = map if self._alone else _pool(torch.get_num_threads()).map
+        shares = [len(x) / len(windows) for x in parts]
+        return weighted_sum(shares, run(_call, programs, arguments))
 
     def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], list[Tensor]]:
         """Return a function that takes a step on a batch on the CPU, and returns the loss.
@@ -78,12 +71,6 @@ class LossProgram:
         rows = [getattr(windows, name) for name in _ROWS[self._loss.model.state]]
         rows += [windows.input.u] + ([] if windows.input.rate is None else [windows.input.rate])
         return [row.contiguous() for row in rows]
-
-    def _run(
-        self, programs: list[Program], arguments: list[tuple[Tensor, ...]]
-    ) -> Iterable[list[Tensor]]:
-        run = map if self._alone else _pool(torch.get_num_threads()).map
-        return run(_call, programs, arguments)
 
     @property
     def _alone(self) -> bool:
@@ -114,8 +101,8 @@ class LossProgram:
                 values = [value.detach().requires_grad_() for value in self._vector.split(vector)]
                 parameters = dict(zip(self._names, values, strict=True))
                 loss = functional_call(self._loss, parameters, (batch,))
-                gradients = torch.autograd.grad(loss.sum(), values, allow_unused=True)
-            return [loss.detach(), self._vector.joined(gradients, tuple(vector.shape[:-1]))]
+                gradients = torch.autograd.grad(loss, values, allow_unused=True)
+            return [loss.detach(), self._vector.joined(gradients)]
 
         return loss_and_gradient
 

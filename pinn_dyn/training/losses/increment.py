@@ -85,12 +85,12 @@ class IncrementLoss(WindowLoss):
         return self.error(predicted[..., 1:, :], windows.increments(model.state))
 
     def error(self, predicted: Tensor, measured: Tensor) -> Tensor:
-        """Return the loss of increments ``(B, k, 2N)``, or ``(E,)`` losses of an ensemble's."""
+        """Return the loss of increments ``(B, k, 2N)``."""
         steps = predicted.shape[-2]
         residual = (predicted - measured) / self.scale[:steps]
         residual = residual[..., self.exact_coordinates if steps == 1 else 0 :]
         if self.huber is None:
-            return torch.mean(residual**2, dim=(-3, -2, -1))
+            return torch.mean(residual**2)
         square = torch.mean(residual**2, dim=-1)
         # 2 d^2 (sqrt(1 + r^2/d^2) - 1), without cancellation for small r.
-        return torch.mean(2 * square / (torch.sqrt(1 + square / self.huber**2) + 1), dim=(-2, -1))
+        return torch.mean(2 * square / (torch.sqrt(1 + square / self.huber**2) + 1))

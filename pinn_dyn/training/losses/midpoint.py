@@ -77,7 +77,7 @@ class MidpointLoss(WindowLoss):
         middle = midpoint(h, x0, dx) if model.state == "qv" else x0 + 0.5 * dx
         (mean_input,) = windows.input.means(windows.t).to(x0)
         residual = h * model.state_derivative(middle, mean_input) - dx
-        return torch.mean((residual[..., self.compared] / self.scale) ** 2, dim=(-2, -1))
+        return torch.mean((residual[..., self.compared] / self.scale) ** 2)
 
 
 def midpoint(h: Tensor, x0: Tensor, increment: Tensor) -> Tensor:

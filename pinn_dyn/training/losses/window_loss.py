@@ -15,10 +15,7 @@ class WindowLoss(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def forward(self, model: Predictor, windows: Windows) -> Tensor:
-        """Return the loss, a scalar, by operations that can be traced.
-
-        For the stacked members of an ensemble and windows ``(E, B, ...)``, return ``(E,)``.
-        """
+        """Return the loss, a scalar, by operations that can be traced."""
 
     def selected(self, windows: Windows, progress: float) -> Windows:
         """Return the part of the windows that the loss uses at ``progress`` from 0 to 1."""

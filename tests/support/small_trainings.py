@@ -1,4 +1,4 @@
-"""Small trainings of ensembles."""
+"""Small trainings."""
 
 from functools import partial
 
