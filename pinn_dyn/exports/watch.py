@@ -6,7 +6,7 @@ import functools
 import hashlib
 import sys
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from operator import is_, itemgetter
 from pathlib import Path
@@ -90,15 +90,9 @@ class Watch:
             self._words.append((value.dtype.str, value.shape, value.tobytes()))
             self._arrays.append((None, 0, value, value.tobytes()))
         elif isinstance(value, Mapping):
-            self._part(value, value.keys())
-            for key, item in value.items():
-                self._words.append(str(key))
-                self._visit(item)
+            self._mapping(value)
         elif isinstance(value, (list, tuple, set, frozenset)):
-            if not isinstance(value, (tuple, frozenset)):
-                self._parts.append((value, len(value), iter, [*value]))
-            for item in sorted(value, key=str) if isinstance(value, (set, frozenset)) else value:
-                self._visit(item)
+            self._items(value)
         elif isinstance(value, (staticmethod, classmethod, types.MethodType)):
             self._visit(getattr(value, "__self__", None))
             self._visit(value.__func__)
@@ -112,6 +106,20 @@ class Watch:
             self._object(value)
         else:
             self._words.append(value.__name__)
+
+    def _mapping(self, value: Mapping[Any, Any]) -> None:
+        self._part(value, value.keys())
+        for key, item in value.items():
+            self._words.append(str(key))
+            self._visit(item)
+
+    def _items(self, value: Collection[Any]) -> None:
+        if isinstance(value, (list, set)):
+            self._parts.append((value, len(value), iter, [*value]))
+        if isinstance(value, (set, frozenset)):
+            value = sorted(value, key=str)
+        for item in value:
+            self._visit(item)
 
     def _part(self, mapping: Mapping[str, Any], keys: Iterable[str]) -> None:
         """Watch the number of items of a mapping, and which objects the values of keys are."""

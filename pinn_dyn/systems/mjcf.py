@@ -109,6 +109,11 @@ def _compiled(mujoco: Any, source: Path | str) -> tuple[Any, set[str]]:
     except ValueError as error:
         if not any(word in str(error) for word in ("file", "mass and inertia")):
             raise
+    return _without_meshes(spec)
+
+
+def _without_meshes(spec: Any) -> tuple[Any, set[str]]:
+    """Return the compiled robot with a mass of 1 kg for bodies whose inertia is not known."""
     unknown = {geom.parent.name for geom in spec.geoms if geom.meshname}
     for element in [*(geom for geom in spec.geoms if geom.meshname), *spec.meshes]:
         spec.delete(element)
