@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pinn_dyn.app.settings import SETTINGS
 from pinn_dyn.run.defaults import defaults, even_validations
 from pinn_dyn.run.validation import ConfigError, check_arguments, check_keys, check_value
-from pinn_dyn.spelling import did_you_mean
+from pinn_dyn.wording import did_you_mean
 
 if TYPE_CHECKING:
     from pinn_dyn.data import DataSource

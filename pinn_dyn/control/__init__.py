@@ -1,7 +1,7 @@
 """Control on a mechanical system, true or learned: laws, references, pipeline and closed loop."""
 
 from pinn_dyn.control.adaptive import AdaptiveTracking
-from pinn_dyn.control.closed_loop import close_loop
+from pinn_dyn.control.closed_loop import ClosedLoopRecord, close_loop
 from pinn_dyn.control.contracts import Motion, Plant, Reference, Stage, Step
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.export import export_law
@@ -19,7 +19,6 @@ from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.pipeline import Pipeline
 from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.control.predictive import PredictiveControl
-from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.control.references import PointToPoint, RandomSetPoints, SetPoint, Sines
 from pinn_dyn.control.region import DataRegion, Guarded
 

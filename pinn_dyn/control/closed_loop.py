@@ -1,10 +1,11 @@
-"""Run a sampled closed loop: a control law on a plant, at control instants."""
+"""A closed loop of a plant and a controller, and its record."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections import deque
+from dataclasses import dataclass, field
 
 import torch
 from pydantic import NonNegativeFloat, PositiveFloat
@@ -13,9 +14,33 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Motion, Plant, Reference, Stage
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.pipeline import STATUS, Pipeline
-from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.progress import Progress
+
+
+@dataclass(frozen=True)
+class ClosedLoopRecord:
+    """K runs of a closed loop, sampled at its control instants; NaN after a run was stopped.
+
+    Attributes:
+        t: control instants, ``(T,)``, s.
+        q, v: true state of the plant, ``(K, T, N)``.
+        u: input applied to the plant, ``(K, T, M)``.
+        u_wanted: input of the law before limits and delay, ``(K, T, M)``.
+        reference: desired motion, ``(K, T, N)`` each.
+        stopped: for each run None, or when and why it was stopped.
+        diagnostics: diagnostics of the controller, ``(K, T)`` each.
+    """
+
+    t: Tensor
+    q: Tensor
+    v: Tensor
+    u: Tensor
+    u_wanted: Tensor
+    reference: Motion
+    stopped: list[str | None]
+    diagnostics: dict[str, Tensor] = field(default_factory=dict)
+
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from torch import Tensor
 
-from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.control.closed_loop import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.plots import COLORS, TRUTH
 from pinn_dyn.systems import Drawable

@@ -8,7 +8,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.control.closed_loop import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop, stopped_runs
 from pinn_dyn.evaluation.tables import with_unit
 from pinn_dyn.plots import (

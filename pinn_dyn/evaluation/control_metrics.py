@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.control.closed_loop import ClosedLoopRecord
 
 # A coordinate whose step is below this part of the largest step has no overshoot.
 _SMALL_STEP = 0.05

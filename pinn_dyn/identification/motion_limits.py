@@ -13,8 +13,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.systems import RigidChain
+from pinn_dyn.wording import did_you_mean
 
 log = logging.getLogger(__name__)
 

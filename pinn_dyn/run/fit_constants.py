@@ -34,9 +34,9 @@ from pinn_dyn.run.defaults import defaults, section
 from pinn_dyn.run.prepared import PreparedTraining
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
-from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
 from pinn_dyn.whole import save_whole, write_whole
+from pinn_dyn.wording import did_you_mean
 
 log = logging.getLogger(__name__)
 

@@ -47,8 +47,8 @@ from pinn_dyn.run.run_folder import (
     merged,
     with_structures,
 )
-from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.training import IncrementLoss, LeastSquares, MidpointLoss, WindowLoss, one_cycle
+from pinn_dyn.wording import did_you_mean
 
 if TYPE_CHECKING:
     from lightning import Callback

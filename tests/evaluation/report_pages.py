@@ -5,8 +5,8 @@ from html.parser import HTMLParser
 import pandas as pd
 import torch
 
+from pinn_dyn.control.closed_loop import ClosedLoopRecord
 from pinn_dyn.control.contracts import Motion
-from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.data import Splits
 from pinn_dyn.evaluation import (
     ControlResult,

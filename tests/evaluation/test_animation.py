@@ -3,8 +3,8 @@ import pytest
 import torch
 from PIL import Image
 
+from pinn_dyn.control.closed_loop import ClosedLoopRecord
 from pinn_dyn.control.contracts import Motion
-from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.animation import animate
 from pinn_dyn.systems import SoftArm
 

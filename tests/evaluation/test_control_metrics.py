@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.integrate import quad
 
+from pinn_dyn.control.closed_loop import ClosedLoopRecord
 from pinn_dyn.control.contracts import Motion
-from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import (
     closed_loop_metrics,
     stopped_runs,

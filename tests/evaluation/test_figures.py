@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 import torch
 
+from pinn_dyn.control.closed_loop import ClosedLoopRecord
 from pinn_dyn.control.contracts import Motion
-from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation import (
     Prediction,
     closed_loop_figure,

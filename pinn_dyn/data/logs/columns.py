@@ -14,7 +14,7 @@ from pydantic import AllowInfNan, BeforeValidator, ConfigDict, TypeAdapter, Vali
 from pydantic.dataclasses import dataclass
 
 from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.spelling import did_you_mean
+from pinn_dyn.wording import did_you_mean
 
 _DEGREE, _TURN = math.pi / 180, 2 * math.pi
 

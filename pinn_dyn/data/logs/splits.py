@@ -14,7 +14,7 @@ from pinn_dyn.data.logs.columns import STRICT
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.source import SPLITS
-from pinn_dyn.spelling import did_you_mean
+from pinn_dyn.wording import did_you_mean
 
 # The default split: from this number of runs on it keeps runs whole.
 _WHOLE_RUNS = 5

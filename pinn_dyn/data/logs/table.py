@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.spelling import did_you_mean
+from pinn_dyn.wording import did_you_mean
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from pinn_dyn import wording
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.readers.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional, vector_columns
-from pinn_dyn.spelling import did_you_mean
+from pinn_dyn.wording import did_you_mean
 
 _KINDS = "fiubmMUTO"  # of arrays that may be columns
 _RATE = re.compile(r"(^|[._@/])(fs|fps|hz|(sampl\w*?)?_?(rate|freq\w*)(_hz)?)$", re.IGNORECASE)
