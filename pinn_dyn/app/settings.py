@@ -83,7 +83,6 @@ class _RunSettings:
 
     checkpoint: Literal["best", "last"]
     trajectory: NonNegativeInt
-    ensemble: bool
     threads: PositiveInt
     trust: Names | None = None
 
@@ -98,6 +97,7 @@ class EvaluateSettings(_RunSettings):
     horizon: PositiveFloat | None
     step: PositiveFloat | None
     windows: Sequence[PositiveFloat] | None
+    ensemble: bool
     thresholds: Mapping[str, PositiveFloat]
 
 
