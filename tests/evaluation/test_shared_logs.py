@@ -45,7 +45,7 @@ WANTED = {
     "19-before-gravity-compensation": ["gravity is missing in the log"],
     "20-coupled-drive": ["the input of joint q1 holds the torques of the joints q2 and q1"],
     "21-moved-by-hand": ["run run_3 .* is 0 there although the robot moves: is it moved by hand"],
-    "22-one-run-backwards": ["run run_3 does not fit the rest of the log from 1"],
+    "22-one-run-backwards": ["run run_3 does not fit the rest of the log from 0"],
     "23-lost-rows": [r"in 2 % of the steps .*: rows are lost"],
     "24-drive-off": [r"run run_0 .* from 5.* tau1, tau2 do not act there, is the drive off\?"],
     "25-action-is-the-state": [r"stop: .*'tau1' is 'q1' of the same row.*The same: tau2"],

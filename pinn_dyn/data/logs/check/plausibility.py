@@ -15,6 +15,8 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
 
+STATE = "distance of the input from a measured state"
+"""Name of the measurement of inputs that are no commands."""
 LOST = "share of steps over lost rows"
 """Name of the measurement of rows that a clock of row numbers does not miss."""
 _FACTORS = (0.8, 1.25)  # range of dq/dt over v without a warning
@@ -43,7 +45,7 @@ def check_inputs(training: list[Recording], q: Columns, u: Columns) -> list[Meas
             "controller can use it; log the command that is sent"
         )
         bad = distance < _COPY
-        measured = ("distance of the input from a measured state", name, distance)
+        measured = (STATE, name, distance)
         results.append(judged(*measured, f"above {_COPY:g} steps", bad, text, "stop"))
     return results
 
@@ -175,7 +177,8 @@ def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measure
         noise = 1.4826 * np.median(np.abs(dq - expected), axis=0)
         noise = np.maximum(noise, 0.02 * np.sqrt((expected**2).mean(axis=0))).clip(min=1e-150)
         weight = ((expected / noise) ** 2).sum(axis=1)
-        sure = weight > 1 / _SURE**2
+        change = ((step * np.diff(item.v, axis=0) / noise) ** 2).sum(axis=1)
+        sure = (weight > 1 / _SURE**2) & (change < weight)  # v does not jump, as at a stop
         passed.append((dq * expected / noise**2).sum(axis=1)[sure] / weight[sure])
     times = np.concatenate(passed)
     late = times > _LOST
