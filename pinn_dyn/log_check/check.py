@@ -32,12 +32,10 @@ from pinn_dyn.log_check.averages import (
 from pinn_dyn.log_check.delay import INTERVAL, DelayCurve, clear_delays, input_delays
 from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import residuals
-from pinn_dyn.log_check.input_faults import input_faults
+from pinn_dyn.log_check.input_faults import SATURATED, input_faults
 from pinn_dyn.log_check.numbers import check_angles, check_velocity_lag
 from pinn_dyn.log_check.page import LogCheck
 from pinn_dyn.log_check.runs import (
-    HELD,
-    RESIDUAL,
     Interval,
     Motion,
     check_rests,
@@ -151,7 +149,7 @@ def check(
     noise = coordinates["noise of q"].to_numpy()
     highest = bandwidth([item.q for item in training], step, noise)
     servo = _follows_targets(source, training, step, longest_delay)
-    rows = max(held_rows(x.raw.q) for x in source.cleaned)
+    rows = max(held_rows(item.q) for _, item in stretches)
     if rows == 1:
         answers = _answers(source, training, others, step, longest_delay, structure, servo)
     else:  # the acceleration of held values means nothing
@@ -232,16 +230,23 @@ def _answers(
     width = max(data.width for data in late)
     motions = [equations_of_motion(data, source.q, source.u, width, rigid) for data in late]
     # A fault of an input or of the clock explains runs that differ, and signs.
-    of_clock = [x for x in source.measurements if x.name == LOST]
-    if all(x.verdict == "ok" for x in [*faults, *of_clock]):
-        of_rests, held_parts = check_rests(motions, names)
-        of_runs, odd_parts = check_runs(motions, names, inverse=inputs <= size, exact=not wrong)
-        results += of_rests + of_runs
-        if not odd and held_parts + odd_parts:
-            parts = held_parts + odd_parts
-            again = _answers(source, training, others, step, longest, structure, servo, parts)
-            kept = [x for x in again.measurements if x.name not in (HELD, RESIDUAL)]
-            return replace(again, measurements=results + kept)
+    clocks = [x for x in source.measurements if x.name == LOST]
+    bad = {x.name for x in [*faults, *clocks] if x.verdict != "ok"}
+    of_parts, parts = [], []
+    if bad <= {SATURATED}:
+        of_parts, parts = check_rests(motions, names)
+    if bad <= {SATURATED} and not parts:
+        of_runs, parts = check_runs(motions, names, inverse=inputs <= size, exact=not wrong)
+        of_parts += of_runs
+    if parts and not odd:
+        again = _answers(source, training, others, step, longest, structure, servo, parts)
+        saturated = any(x.name == SATURATED and x.verdict != "ok" for x in again.measurements)
+        if not saturated:  # parts that do not fit look like a saturation
+            asked = {x.name for x in of_parts}
+            kept = [x for x in again.measurements if x.name not in asked]
+            return replace(again, measurements=of_parts + kept)
+    if not bad:
+        results += of_parts
         if not any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok"):
             results += check_signs(motions[0], source.u, curves, rigid)
     results += faults
@@ -391,7 +396,7 @@ def _condition(excitation: RigidExcitation) -> Measurement:
 def _inputs_table(
     source: logs.LogSource, training: list[logs.Recording], delays: Sequence[DelayCurve]
 ) -> pd.DataFrame:
-    u = np.vstack([item.u for item in training])
+    u = np.vstack([item.u[:, : len(delays)] for item in training])
     table = {
         "input": source.input_labels[: len(delays)],
         "min": u.min(axis=0),

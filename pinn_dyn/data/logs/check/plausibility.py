@@ -169,7 +169,7 @@ def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measure
     A clock of row numbers does not see them. The time that passes from row to row is that of all
     joints together, Δt = Σ v_j Δq_j / σ_j² / Σ v_j² / σ_j².
     """
-    passed = []
+    passed, inside = [], []
     for item in recordings:
         assert item.v is not None
         step = np.diff(item.t)[:, None]
@@ -177,11 +177,12 @@ def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measure
         noise = 1.4826 * np.median(np.abs(dq - expected), axis=0)
         noise = np.maximum(noise, 0.02 * np.sqrt((expected**2).mean(axis=0))).clip(min=1e-150)
         weight = ((expected / noise) ** 2).sum(axis=1)
-        change = ((step * np.diff(item.v, axis=0) / noise) ** 2).sum(axis=1)
-        sure = (weight > 1 / _SURE**2) & (change < weight)  # v does not jump, as at a stop
+        moving = (np.abs(item.v) * np.median(step) > noise).any(axis=1)
+        sure = weight > 1 / _SURE**2
+        inside.append((moving[1:] & moving[:-1])[sure])
         passed.append((dq * expected / noise**2).sum(axis=1)[sure] / weight[sure])
     times = np.concatenate(passed)
-    late = times > _LOST
+    late = (times > _LOST) & np.concatenate(inside)  # not at a stop by a brake
     whole = np.abs(times - times.round())[late] < 0.25
     lost, early = int(late.sum()), int((times < 2 - _LOST).sum())
     bad = lost >= 5 and lost > _OFTEN * early and whole.mean() > 0.8
