@@ -232,7 +232,8 @@ def _answers(
     # A fault of an input or of the clock explains runs that differ, and signs.
     clocks = [x for x in source.measurements if x.name == LOST]
     bad = {x.name for x in [*faults, *clocks] if x.verdict != "ok"}
-    of_parts, parts = [], []
+    of_parts: list[Measurement] = []
+    parts: list[Interval] = []
     if bad <= {SATURATED}:
         of_parts, parts = check_rests(motions, names)
     if bad <= {SATURATED} and not parts:

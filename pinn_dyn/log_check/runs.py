@@ -342,13 +342,13 @@ def check_runs(
     rows = narrow.equations[0].window
     runs = narrow.data.run[np.unique(rows, return_index=True)[1]]  # of each window
     limit = _FAR * usual
-    if not _follow((residual > limit).any(axis=1), runs):
+    if not _follow(np.asarray((residual > limit).any(axis=1)), runs):
         limit = np.maximum(_RATIO * usual, _RESIDUAL)
     odd = (residual > limit) & (smooth < _OF_WIDTH * residual)
     expected = f"below {_RATIO:g}"
     results, parts = [], []
     share = odd.any(axis=1).mean()
-    few = share <= _ODD or (share < 1 - _AGREE and _follow(odd.any(axis=1), runs))
+    few = share <= _ODD or (share < 1 - _AGREE and _follow(np.asarray(odd.any(axis=1)), runs))
     for k in np.unique(runs) if few else ():
         # A motion that no other run has may be extrapolated badly: include it in the fit.
         included = [np.where(runs == k, 1, x.weights) for x in narrow.equations]

@@ -225,7 +225,8 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
     for k, name in enumerate(names):
         reversed_k = np.where(np.arange(size) == k, -1.0, 1.0)
         motion = _scaled(data, reversed_k)
-        forces = structure.rigid_force(*map(torch.from_numpy, (motion.q, motion.v, motion.a)))
+        q, v, a = map(torch.from_numpy, (motion.q, motion.v, motion.a))
+        forces = structure.rigid_force(q, v, a)
         same = float((data.u[:, k] * forces[:, k].numpy()).sum()) > 0
         columns = "q and v" if same else "q, v and u"
         text = f"joint {name} turns the other way in the log: reverse its axis, or {columns} of it"
