@@ -29,6 +29,7 @@ COLUMNS = ["name", "value", "low", "high", "unit", "start", "known"]
 OPEN = 0.5
 """Part of the prior variance above which a constant or direction is not determined."""
 _CONFLICT = 3.0  # prior standard deviations
+_FAR = 3.0  # factor between a mass and that of the URDF
 
 
 class Direction(NamedTuple):
@@ -160,6 +161,27 @@ def contradicted(model: LearnedConstants, fit: Fit) -> list[str]:
             )
             lines.append(f"{moved}: {remedy.format(owner)}")
     return lines
+
+
+def far_masses(table: pd.DataFrame) -> list[str]:
+    """Describe masses whose 95 % interval is beyond a factor of 3 of the start of the fit.
+
+    Args:
+        table: constants of a first fit, which starts from the masses of the URDF.
+    """
+    masses = table[table["name"].str.startswith("mass of ")]
+    far = masses[
+        (masses["low"] > _FAR * masses["start"]) | (masses["high"] * _FAR < masses["start"])
+    ]
+    parts = [
+        f"the {row.name} is {row.value:.3g} kg ({row.low:.3g} to {row.high:.3g}), in the URDF "
+        f"{row.start:.3g} kg"
+        for row in far.itertuples(index=False, name="Mass")
+    ]
+    if not parts:
+        return []
+    cause = "is an input reversed or in another unit, or does the URDF describe another robot?"
+    return [f"{'; '.join(parts)}: {cause} Check the log with the URDF"]
 
 
 def common_factor(model: KnownMechanics, fit: Fit) -> float:

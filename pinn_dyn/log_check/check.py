@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from pinn_dyn import wording
 from pinn_dyn.data import logs
 from pinn_dyn.data.bandwidth import bandwidth
 from pinn_dyn.data.logs.check.holds import held_rows
-from pinn_dyn.data.logs.check.plausibility import LOST
+from pinn_dyn.data.logs.check.plausibility import LOST, STATE
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import round_rate
 from pinn_dyn.identification.rigid_excitation import MOST, RigidExcitation, rigid_excitation
@@ -30,11 +31,14 @@ from pinn_dyn.log_check.averages import (
 )
 from pinn_dyn.log_check.delay import INTERVAL, DelayCurve, clear_delays, input_delays
 from pinn_dyn.log_check.equation import Regressor
-from pinn_dyn.log_check.input_faults import input_faults
+from pinn_dyn.log_check.figures import residuals
+from pinn_dyn.log_check.input_faults import SATURATED, input_faults
 from pinn_dyn.log_check.numbers import check_angles, check_velocity_lag
 from pinn_dyn.log_check.page import LogCheck
 from pinn_dyn.log_check.runs import (
+    Interval,
     Motion,
+    check_rests,
     check_runs,
     check_signs,
     driven_joint,
@@ -44,6 +48,9 @@ from pinn_dyn.log_check.stored import store, stored
 from pinn_dyn.log_check.structure import FIT, SCALE, compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
 _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
@@ -71,6 +78,24 @@ def verdict(source: logs.LogSource, structure: Structure | None = None) -> list[
         check(source, structure=structure)
         texts = stored(source, _regressor(structure, len(source.u.columns)))
     return texts or []
+
+
+def residual_figure(source: logs.LogSource, structure: Structure) -> Figure | None:
+    """Draw what the rigid bodies leave of the forces over q and over v, per joint.
+
+    The result is None with another number of inputs than joints, or with too few rows.
+    """
+    rigid = _regressor(structure, len(source.u.columns))
+    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
+    if rigid is None or training[0].u.shape[1] != len(source.u.columns):
+        return None
+    step = float(np.median(np.diff(training[0].t)))
+    widths = averages_of_widths(parts_of(training, step), step)
+    if not widths:
+        return None
+    data = widths[compared(widths)[0]]
+    motion = equations_of_motion(data, source.q, source.u, data.width, rigid)
+    return None if motion is None else residuals(motion, source.q, source.v, source.u)
 
 
 @dataclass
@@ -124,7 +149,7 @@ def check(
     noise = coordinates["noise of q"].to_numpy()
     highest = bandwidth([item.q for item in training], step, noise)
     servo = _follows_targets(source, training, step, longest_delay)
-    rows = max(held_rows(x.raw.q) for x in source.cleaned)
+    rows = max(held_rows(item.q) for _, item in stretches)
     if rows == 1:
         answers = _answers(source, training, others, step, longest_delay, structure, servo)
     else:  # the acceleration of held values means nothing
@@ -166,8 +191,9 @@ def _answers(
     longest: float,
     structure: Structure | None,
     servo: bool,
+    odd: Sequence[Interval] = (),
 ) -> _Answers:
-    """Ask the equation of motion."""
+    """Ask the equation of motion, without the parts of runs that do not fit the others."""
     inputs, size = len(source.u.columns), len(source.q.columns)
     rigid = _regressor(structure, inputs)
     first = parts_of(training, step)
@@ -175,7 +201,10 @@ def _answers(
     names = list(dict.fromkeys(item.run for item in everything))
     if inputs > size:
         everything = [with_products(item) for item in everything]
-    widths = averages_of_widths(everything, step)
+    widths = [
+        data.rows(~np.any([x.of(data) for x in odd], axis=0)) if odd else data
+        for data in averages_of_widths(everything, step)
+    ]
     of_training = [data.rows(data.stretch < len(first)) for data in widths]
     curves = input_delays(first, longest=longest, rigid=rigid, widths=of_training)
     results: list[Measurement] = []
@@ -183,6 +212,9 @@ def _answers(
         return _Answers(results, curves, [0.0] * inputs, [1] * inputs)
     chosen = compared(widths)
     faults, curves, held = input_faults([of_training[k] for k in chosen], curves, source.u, rigid)
+    states = {x.place for x in source.measurements if x.name == STATE and x.verdict == "stop"}
+    pairs = zip(curves, source.u.columns, strict=False)
+    curves = [x.without("the input is a state") if name in states else x for x, name in pairs]
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else clear_delays(curves, step)
     late = [widths[k].delayed(clear) for k in chosen]
@@ -198,9 +230,24 @@ def _answers(
     width = max(data.width for data in late)
     motions = [equations_of_motion(data, source.q, source.u, width, rigid) for data in late]
     # A fault of an input or of the clock explains runs that differ, and signs.
-    of_clock = [x for x in source.measurements if x.name == LOST]
-    if all(x.verdict == "ok" for x in [*faults, *of_clock]):
-        results += check_runs(motions, names, inverse=inputs <= size, exact=not wrong)
+    clocks = [x for x in source.measurements if x.name == LOST]
+    bad = {x.name for x in [*faults, *clocks] if x.verdict != "ok"}
+    of_parts: list[Measurement] = []
+    parts: list[Interval] = []
+    if bad <= {SATURATED}:
+        of_parts, parts = check_rests(motions, names)
+    if bad <= {SATURATED} and not parts:
+        of_runs, parts = check_runs(motions, names, inverse=inputs <= size, exact=not wrong)
+        of_parts += of_runs
+    if parts and not odd:
+        again = _answers(source, training, others, step, longest, structure, servo, parts)
+        saturated = any(x.name == SATURATED and x.verdict != "ok" for x in again.measurements)
+        if not saturated:  # parts that do not fit look like a saturation
+            asked = {x.name for x in of_parts}
+            kept = [x for x in again.measurements if x.name not in asked]
+            return replace(again, measurements=of_parts + kept)
+    if not bad:
+        results += of_parts
         if not any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok"):
             results += check_signs(motions[0], source.u, curves, rigid)
     results += faults
@@ -350,7 +397,7 @@ def _condition(excitation: RigidExcitation) -> Measurement:
 def _inputs_table(
     source: logs.LogSource, training: list[logs.Recording], delays: Sequence[DelayCurve]
 ) -> pd.DataFrame:
-    u = np.vstack([item.u for item in training])
+    u = np.vstack([item.u[:, : len(delays)] for item in training])
     table = {
         "input": source.input_labels[: len(delays)],
         "min": u.min(axis=0),

@@ -106,16 +106,18 @@ class EquationOfMotionRegression:
             totals * scale**2,
         )
 
-    def robust_weights(self, y: str, x: Sequence[str], base: np.ndarray) -> np.ndarray:
-        """Return weights ``(1, B)`` that are small for blocks that disagree with the others.
+    def robust_weights(
+        self, y: str, x: Sequence[str], base: np.ndarray, start: np.ndarray
+    ) -> np.ndarray:
+        """Return weights ``(1, B)`` that are small for blocks that disagree with most others.
 
         The fits are reweighted with the loss of Geman and McClure (1985), from the weights ``base``
-        ``(B,)``.
+        ``(B,)``, and from the blocks of the mask ``start``, whose residual is the usual one.
         """
-        weights = np.ones(len(base))
+        weights = start.astype(float)
         for cut in 0.5 ** np.arange(1, _ITERATIONS + 1):
             residual = self.residuals(self.fit(y, x, (weights * base)[None]))
-            usual = np.median(residual, axis=0).clip(min=1e-3)
+            usual = np.median(residual[start], axis=0).clip(min=1e-3)
             worst = (residual / usual).max(axis=1)
             weights = 1 / (1 + (worst / max(2.5, cut * worst.max())) ** 2) ** 2
         return (weights * base)[None]

@@ -42,12 +42,13 @@ def forces(motion: Motion) -> Figure:
     return figure
 
 
-def residuals(motion: Motion, q: Columns, v: Columns | None) -> Figure | None:
+def residuals(motion: Motion, q: Columns, v: Columns | None, u: Columns) -> Figure | None:
     """Draw the residual of each force over position and speed of its joint; None for others.
 
     Args:
         motion: equations of motion, one per joint.
         q, v: columns of the log, whose units the axes have; without v those of q per second.
+        u: columns of the forces, which are drawn in SI units.
     """
     from matplotlib.figure import Figure  # takes a quarter of a second
 
@@ -71,7 +72,7 @@ def residuals(motion: Motion, q: Columns, v: Columns | None) -> Figure | None:
             ax.plot(*_means(x, y), color=COLORS[0], linewidth=1.5)
             ax.axhline(0, color="gray", linewidth=0.6)
             ax.set_xlabel(f"{names[key][k]} [{units[key][k]}]")
-        grid[k, 0].set_ylabel(f"{equation.labels[0]}: residual")
+        grid[k, 0].set_ylabel(f"{equation.labels[0]}: residual [{u.units[k]}]")
     title = "Residual of each force; on the right with its dry friction; lines are means"
     figure.suptitle(title, fontsize="medium")
     return figure

@@ -21,6 +21,8 @@ from pinn_dyn.log_check.equation import (
 
 HELD = "rows between two values of the input"
 """Name of the measurement of inputs that are slower than the log."""
+SATURATED = "saturated samples"
+"""Name of the measurement of commands that exceed what acts."""
 _ROWS = 2500  # of the regression
 _LARGEST_DRIFT = 0.05
 _SHIFT = 0.02  # distance of candidates at the end of a run, s
@@ -135,7 +137,7 @@ def _faults(
             f"act where more is logged ({100 * share:.0f} % of the samples); log the measured "
             "force, or limit the column to what the drive can do"
         )
-        results.append(judged("saturated samples", name, share, "0", share > 0, text))
+        results.append(judged(SATURATED, name, share, "0", share > 0, text))
         rate = 1 / (rows * (data.recordings[0].t[1] - data.recordings[0].t[0]))
         text = (
             f"input {name!r} is held at {rate:.3g} Hz: its values repeat for {rows} rows, but the "

@@ -38,6 +38,7 @@ def explained_share(data: Averages) -> float:
     The result is 1 where the independent rows are too few to tell.
     """
     data = data.independent()
+    data = data.rows(data.row_weights()[:, 0] == 1)  # no stop, no jump of q
     q, v, u = data.q, data.v - data.v.mean(axis=0), data.u - data.u.mean(axis=0)
     if len(data) < 6 * (3 * q.shape[1] + u.shape[1]):
         return 1.0

@@ -217,7 +217,9 @@ def check_report(check: LogCheck, *, command: str) -> str:
     )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
     parts = []
-    if check.motion is not None and (figure := residuals(check.motion, source.q, source.v)):
+    if check.motion is not None and (
+        figure := residuals(check.motion, source.q, source.v, source.u)
+    ):
         drawn = drawing(figure, "residual of each force over position and speed of its joint")
         parts.append(_anchored(_RESIDUALS, paragraph(_OF_STATES), drawn))
     if check.delays:

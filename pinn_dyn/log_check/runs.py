@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from pinn_dyn.data.logs import Columns, Measurement
 from pinn_dyn.data.logs.errors import listed
 from pinn_dyn.data.logs.measurement import judged
-from pinn_dyn.log_check.averages import Averages
+from pinn_dyn.log_check.averages import CUT, Averages
 from pinn_dyn.log_check.delay import FEWEST, DelayCurve
 from pinn_dyn.log_check.equation import (
     EquationOfMotionRegression,
@@ -27,6 +28,8 @@ from pinn_dyn.log_check.equation import (
 
 RESIDUAL = "residual over that of the median window"
 """Name of the measurement that compares the windows of runs."""
+HELD = "time in which the joints are held [s]"
+"""Name of the measurement of brakes and contacts."""
 INERTIA = "share of positive effective inertia"
 """Name of the measurement that judges the sign of an input."""
 _WINDOW = 0.5  # s
@@ -34,17 +37,38 @@ _WIDTHS, _MOST = 10, 200  # widths in a window, and windows of a log
 _FEWEST = 8  # rows of a window
 _PER_TERM = 6  # rows at least
 _RESIDUAL, _RATIO = 0.3, 3.0  # of an odd window: share of the signal, and of the usual residual
+_FAR = 6.0  # residual over the usual one of an odd window among odd neighbors
 _OF_WIDTH = 2.0  # residual with a wide kernel over that with a narrow one, of a fault of the log
+_REST = 0.1  # shortest rest, s
 _ODD = 0.4  # share of odd windows up to which the others tell the right equation
-_WORSE = 2.0  # residual of rigid bodies over that of a generic equation, of a wrong robot
+_AGREE, _AGREES = 0.4, 0.1  # share of windows that have to agree on an equation; their weight
+_WORSE = 2.0  # residual of an equation over that of another, of a wrong equation
 _ACTS = 0.5  # residual without an input over that with it
-_UNKNOWN = "is it another payload, or are columns exchanged, reversed or stuck?"
+_UNKNOWN = "is it another payload or unit, or are columns exchanged, reversed or stuck?"
 _UNKNOWN_WINDOWS = 4  # odd windows of a run from which an unknown cause is named
 _CLEAR = 0.9  # correlation from which a scale is clear
-_SCALES = (0.55, 1.8)  # of another load; beyond, another unit
+_SCALES = (0.2, 5.0)  # of another load; beyond, another unit
 _NOTICEABLE = 0.05  # share of a force from which its inertial part is judged
 _SIGN_ROWS = 600  # from which the sign of an input is judged
 _FORCES = {"Nm", "N", "A"}  # units of inputs that push their joint forward
+
+
+class Interval(NamedTuple):
+    """A part of a run, by the number of the run, and its times in s."""
+
+    run: int
+    start: float
+    end: float
+
+    def meets(self, other: Interval) -> bool:
+        """Return true if two parts of a run have a time in common."""
+        return self.start <= other.end and other.start <= self.end
+
+    def of(self, data: Averages) -> np.ndarray:
+        """Return the rows whose averages include this part, ``(R,)``."""
+        edge = CUT * data.width
+        inside = (data.t > self.start - edge) & (data.t < self.end + edge)
+        return np.asarray((data.run == self.run) & inside)
 
 
 @dataclass(frozen=True)
@@ -58,6 +82,7 @@ class Equation:
         window: number of the window of each row, ``(R,)``.
         theta: coefficients, ``(P, K)``.
         weights: weights of the windows, ``(1, B)``, small where they disagree with the others.
+        agree: windows that do not, ``(B,)``.
         offset: constant that was subtracted from the forces, ``(K,)``.
         row_weights: weights of the rows, ``(R, 1)``, small at jumps of q.
         of_bodies: X are the terms of rigid bodies.
@@ -71,6 +96,7 @@ class Equation:
     window: np.ndarray
     theta: np.ndarray
     weights: np.ndarray
+    agree: np.ndarray
     offset: np.ndarray
     row_weights: np.ndarray
     of_bodies: bool = False
@@ -86,24 +112,32 @@ class Equation:
         theta = self.theta if weights is None else self._fitted(weights)
         left = np.abs(self.columns["y"] - self._terms() @ theta)
         if self.resting is not None:
-            signs = np.abs(self._terms()[:, self.friction]).max(axis=0)
-            level = signs @ np.abs(theta[self.friction])
-            left = np.where(self.resting[:, None], (left - level).clip(min=0), left)
+            at_rest = (left - self.friction_level(theta)).clip(min=0)
+            left = np.where(self.resting[:, None], at_rest, left)
         means, signal = (self._means(x) for x in (left, self.columns["y"]))
         usual = np.maximum(np.median(signal, axis=0), 1e-9 * signal.max(axis=0))
         return means / np.maximum(signal, usual.clip(min=1e-300))
 
-    def moving_windows(self) -> np.ndarray:
-        """Return the windows in which the joint moves most of the time, ``(B,)``; all if none."""
-        if self.resting is None:
-            return np.ones(self.window.max() + 1, dtype=bool)
-        moving = np.bincount(self.window, ~self.resting) > np.bincount(self.window) / 2
-        return moving if moving.any() else ~moving
+    def usual(self) -> np.ndarray:
+        """Return the residual of the median window that agrees with the equation, ``(K,)``.
+
+        The joint moves in these windows most of the time, if there are such windows.
+        """
+        agree = self.agree
+        if self.resting is not None:
+            moving = np.bincount(self.window, ~self.resting) > np.bincount(self.window) / 2
+            agree = moving & agree if (moving & agree).any() else agree
+        return np.median(self.of_windows()[agree], axis=0)
 
     def _means(self, x: np.ndarray) -> np.ndarray:
         """Return the root mean squares of columns in each window, ``(B, K)``."""
         squares = [np.bincount(self.window, column) for column in (self.row_weights * x**2).T]
         return np.sqrt(np.transpose(squares) / np.bincount(self.window)[:, None])
+
+    def friction_level(self, theta: np.ndarray) -> np.ndarray:
+        """Return the largest dry friction of the joint with coefficients ``(P, K)``, ``(K,)``."""
+        signs = np.abs(self._terms()[:, self.friction]).max(axis=0)
+        return np.asarray(signs @ np.abs(theta[self.friction]))
 
     def dry_friction(self) -> np.ndarray:
         """Return the part of X theta that is dry friction of the own joint, ``(R,)``."""
@@ -183,7 +217,7 @@ def equations_of_motion(
             _equation({"terms": terms(data, form), "inputs": inputs}, y, data, window, q.columns)
             for form, y in (("increments", data.v), ("acceleration", data.a))
         ]
-        equations = [min(forms, key=lambda x: np.median(x.of_windows()))]
+        equations = [min(forms, key=lambda x: np.median(x.usual()))]
     elif size:
         regressor = bodies(data, rigid)
         for i in range(size):
@@ -198,7 +232,7 @@ def equations_of_motion(
                 )
                 for known in ([None] if regressor is None else [None, regressor])
             ]
-            least = [float(np.median(x.of_windows())) for x in forms]
+            least = [float(x.usual()[0]) for x in forms]
             # Rigid bodies judge motions well that no other run has, unless a force is missing.
             drawn.append(forms[-1])
             best = -1 if least[-1] < _WORSE * least[0] else 0
@@ -235,7 +269,7 @@ def _equation(
     # A run in a larger unit would outweigh all others.
     totals = np.hstack([regression.fit(name, list(x)).totals for name in ("y", "u")])
     base = regression.spreads(totals).clip(min=1).max(axis=1) ** -2.0
-    weights = regression.robust_weights("y", list(x), base)
+    weights = _weights(regression, list(x), base, _late(data, regression.block))
     return Equation(
         columns=columns,
         x=list(x),
@@ -243,11 +277,37 @@ def _equation(
         window=regression.block,
         theta=regression.fit("y", list(x), weights).theta[0],
         weights=weights,
+        agree=weights[0] > _AGREES * base,
         offset=offset,
         row_weights=row_weights,
         resting=resting,
         friction=friction,
     )
+
+
+def _late(data: Averages, block: np.ndarray) -> np.ndarray:
+    """Return the blocks in the later half of their run, ``(B,)``."""
+    rows = np.bincount(data.run).clip(min=1)
+    late = data.passed > (np.bincount(data.run, data.passed) / rows)[data.run]
+    return np.bincount(block, late) > np.bincount(block) / 2
+
+
+def _weights(
+    regression: EquationOfMotionRegression, x: list[str], base: np.ndarray, late: np.ndarray
+) -> np.ndarray:
+    """Return the weights of the windows from which most windows have the smallest residual.
+
+    The fits start from all windows, and from the earlier and the later half of each run: a payload
+    that is picked up in the middle changes half of the windows.
+    """
+    results = []
+    for start in (np.ones(len(base), dtype=bool), ~late, late):
+        if start.any():
+            weights = regression.robust_weights("y", x, base, start)
+            left = regression.residuals(regression.fit("y", x, weights)).max(axis=1)
+            results.append((float(np.quantile(left, _AGREE)), weights))
+    least, weights = min(results[1:], key=lambda result: result[0], default=results[0])
+    return weights if least < results[0][0] / _WORSE else results[0][1]
 
 
 def check_runs(
@@ -256,7 +316,7 @@ def check_runs(
     *,
     inverse: bool,
     exact: bool = True,
-) -> list[Measurement]:
+) -> tuple[list[Measurement], list[Interval]]:
     """Compare the windows of each run with the equation of the others.
 
     A window is odd if its residual is three times that of the median window, also if the fit
@@ -267,32 +327,34 @@ def check_runs(
         names: names of the runs.
         inverse: the equations are those of forces.
         exact: the equations are not known to be wrong; else windows without a cause do not count.
+
+    Returns:
+        Measurements, and the parts of runs that do not fit.
     """
     narrow, wide = motions
     if narrow is None or wide is None:
-        return []
+        return [], []
     labels = [label for x in narrow.equations for label in x.labels]
     numbers, of_wide = np.unique(narrow.window), np.unique(wide.window)
     residual, smooth = narrow.residual(), np.full((len(numbers), len(labels)), np.inf)
     smooth[np.isin(numbers, of_wide)] = wide.residual()[np.isin(of_wide, numbers)]
-    parts = (x.moving_windows() for x in narrow.equations)
-    usual = np.hstack(
-        [
-            np.median(x.of_windows()[moving], axis=0)
-            for x, moving in zip(narrow.equations, parts, strict=True)
-        ]
-    ).clip(min=1e-3)
-    odd = (residual > _RATIO * usual) & (residual > _RESIDUAL) & (smooth < _OF_WIDTH * residual)
+    usual = np.hstack([x.usual() for x in narrow.equations]).clip(min=_NOTICEABLE / _RATIO)
     rows = narrow.equations[0].window
     runs = narrow.data.run[np.unique(rows, return_index=True)[1]]  # of each window
+    limit = _FAR * usual
+    if not _follow(np.asarray((residual > limit).any(axis=1)), runs):
+        limit = np.maximum(_RATIO * usual, _RESIDUAL)
+    odd = (residual > limit) & (smooth < _OF_WIDTH * residual)
     expected = f"below {_RATIO:g}"
-    results = []
-    few = odd.any(axis=1).mean() <= _ODD
+    results, parts = [], []
+    share = odd.any(axis=1).mean()
+    few = share <= _ODD or (share < 1 - _AGREE and _follow(np.asarray(odd.any(axis=1)), runs))
     for k in np.unique(runs) if few else ():
         # A motion that no other run has may be extrapolated badly: include it in the fit.
         included = [np.where(runs == k, 1, x.weights) for x in narrow.equations]
         again = narrow.residual(included)
-        bad = odd & (runs == k)[:, None] & (again > _RATIO / 1.5 * usual) & (again > _RESIDUAL)
+        least = np.maximum(_RATIO * usual, np.minimum(limit, _RESIDUAL)) / 1.5
+        bad = odd & (runs == k)[:, None] & (again > least)
         bad &= _in_a_row(bad)
         if not bad.any():
             continue
@@ -305,12 +367,61 @@ def check_runs(
         text = (
             f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
             f"{times[-1]:.4g} s: the residual of {labels[j]!r} is {ratios[:, j].max():.3g} times "
-            f"that of the median window; {cause or _UNKNOWN} Correct or leave out this part: all "
-            "numbers of the check include it"
+            f"that of the median window; {cause or _UNKNOWN} Correct or leave out this part"
         )
         results.append(judged(RESIDUAL, names[k], ratios.max(), expected, True, text))
+        parts.append(Interval(int(k), float(times[0]), float(times[-1])))
     largest = float((residual / usual).max())
-    return results or [judged(RESIDUAL, "all runs", largest, expected, False, "")]
+    return results or [judged(RESIDUAL, "all runs", largest, expected, False, "")], parts
+
+
+def _follow(odd: np.ndarray, runs: np.ndarray) -> bool:
+    """Tell whether windows that are odd follow each other more often than by chance."""
+    same_run = np.diff(runs) == 0
+    switches = np.diff(odd.astype(int))[same_run] != 0
+    return len(switches) > 0 and bool(switches.mean() < odd.mean() * (1 - odd.mean()))
+
+
+def check_rests(
+    motions: Sequence[Motion | None], names: Sequence[str]
+) -> tuple[list[Measurement], list[Interval]]:
+    """Find parts in which all joints rest, although the inputs exceed their dry friction.
+
+    Kernels of two widths must agree on a part.
+    """
+    narrow, wide = (_held_parts(x) for x in motions)
+    parts = [x for x in narrow if any(x.run == y.run and x.meets(y) for y in wide)]
+    if not parts:
+        return [judged(HELD, "all runs", 0.0, "0", False, "")], []
+    first, more = parts[0], f" and {len(parts) - 1} more parts" if len(parts) > 1 else ""
+    text = (
+        f"run {names[first.run]} from {first.start:.4g} to {first.end:.4g} s{more}: the joints are "
+        "held although the inputs would move them: by a brake, an end stop or a contact? Leave out "
+        "these parts"
+    )
+    seconds = sum(x.end - x.start for x in parts)
+    return [judged(HELD, names[first.run], seconds, "0", True, text)], parts
+
+
+def _held_parts(motion: Motion | None) -> list[Interval]:
+    """Return rests in which an input exceeds the dry friction at poses of other motions."""
+    if motion is None:
+        return []
+    data = motion.data
+    pushed, moving = np.zeros(len(data), dtype=bool), data.moving.any(axis=1)
+    for equation in motion.equations:
+        count = equation.theta.shape[0]
+        if equation.resting is None or (~equation.resting).sum() < _PER_TERM * count:
+            return []
+        y, explained = equation.predicted()
+        left = np.abs(y - explained)[:, 0]
+        level = _RATIO / 2 * equation.friction_level(equation.theta)[0]
+        pushed |= left > level + _RATIO * np.median(left[moving])
+    low, high = data.q[moving].min(axis=0), data.q[moving].max(axis=0)
+    pushed &= ~moving & ((data.q >= low) & (data.q <= high)).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.r_[False, pushed, False])).reshape(-1, 2)
+    parts = [Interval(int(data.run[k]), data.t[k], data.t[last - 1]) for k, last in edges]
+    return [x for x in parts if x.end - x.start > _REST]
 
 
 def _in_a_row(bad: np.ndarray) -> np.ndarray:
@@ -360,10 +471,10 @@ def _cause(motion: Motion, rows: np.ndarray, j: int, labels: Sequence[str], inve
     best = int(match[:, j].argmax())
     if inverse and best != j and match[best, j] > max(_CLEAR, abs(match[j, j])):
         return f"{labels[best]!r} fits {labels[j]!r} better: are they exchanged?"
-    if abs(match[j, j]) > _CLEAR and not _SCALES[0] < scale < _SCALES[1]:
-        cause = "is its sign reversed" if scale < 0 else "is it in another unit"
-        return f"{name} is {scale:.3g} times what the other runs predict: {cause}?"
-    return ""
+    if abs(match[j, j]) < _CLEAR or _SCALES[0] < scale < _SCALES[1]:
+        return ""
+    cause = "is its sign reversed" if scale < 0 else "is it in another unit"
+    return f"{name} is {scale:.3g} times what the equation of the others predicts: {cause}?"
 
 
 def check_signs(

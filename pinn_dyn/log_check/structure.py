@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import torch
 
 from pinn_dyn import wording
@@ -41,7 +42,8 @@ _FEW, _BEST = 300, 5  # rows that causes are tried on; causes that are judged on
 _TRIED = 3  # inputs with the largest residuals that causes have to explain
 _WHITE = 0.8  # residual with a wide kernel over that with a narrow one, of noise
 _ANGLES = np.linspace(-np.pi, np.pi, 12, endpoint=False)  # rad, of homing offsets
-_FACTORS = np.array([2.0, 3.0, 4.0, 5.0, 6.0, 10.0])  # of gears, and their inverses
+_FACTORS = [1.0, *(x**k for x in (1.4, 2.0, 3.0, 5.0, 10.0) for k in (1, -1))]  # of gears
+_REFINED, _TRIALS = 2, 30  # joints whose factor and offset are refined; trials of each
 _CHUNK = 500  # rows of a call of a regressor, for its memory
 _SCALE = 2.5  # of torques over those of the URDF's bodies
 _CERTAIN = 0.1  # largest standard error of a scale, as a share of it
@@ -222,14 +224,17 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
 
     for k, name in enumerate(names):
         reversed_k = np.where(np.arange(size) == k, -1.0, 1.0)
-        power = float((data.u[:, k] * data.v[:, k]).mean())
-        columns = "q, v and u" if power > 0 else "q and v"
+        motion = _scaled(data, reversed_k)
+        q, v, a = map(torch.from_numpy, (motion.q, motion.v, motion.a))
+        forces = structure.rigid_force(q, v, a)
+        same = float((data.u[:, k] * forces[:, k].numpy()).sum()) > 0
+        columns = "q and v" if same else "q, v and u"
         text = f"joint {name} turns the other way in the log: reverse its axis, or {columns} of it"
-        yield changed(text, _scaled(data, reversed_k))
+        yield changed(text, motion)
         springs = wording.setting("model.springs", [name])
         text = f"a spring at joint {name} explains it: fit it with {springs}"
         yield replace(plain, text=text, extra=(k, data.q[:, k]))
-        yield _affine(plain, rigid, k, name, joints)
+    yield from _affine(plain, rigid, names, joints)
     for i in range(size):
         for j in range(size):
             pair = f"{names[j]} and {names[i]}"
@@ -266,41 +271,59 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
                 yield cause
 
 
-def _affine(plain: _Cause, rigid: Regressor, k: int, name: str, joints: Sequence[int]) -> _Cause:
-    """Return the best offset or factor of coordinate k, or both if neither explains it."""
+def _affine(
+    plain: _Cause, rigid: Regressor, names: Sequence[str], joints: Sequence[int]
+) -> Iterator[_Cause]:
+    """Return the best factor and offset of the coordinates that they explain best."""
     data = plain.data
-    k_alone = np.arange(data.q.shape[1]) == k
 
-    def changed(factor: float, offset: float) -> _Cause:
+    def changed(k: int, factor: float, offset: float) -> _Cause:
+        k_alone = np.arange(data.q.shape[1]) == k
         motion = _scaled(data, np.where(k_alone, 1 / factor, 1.0))
         motion = replace(motion, q=motion.q + offset * k_alone)
         return _Cause("", motion, rigid(motion.q, motion.v, motion.a))
 
-    def least(pairs: list[tuple[float, float]]) -> tuple[float, tuple[float, float]]:
-        trials = [(_left(changed(*pair), joints), pair) for pair in pairs]
-        return min(trials, key=lambda trial: trial[0])
+    def left(k: int, factor: float, offset: float) -> float:
+        return _left(changed(k, factor, offset), joints)
 
-    factors = [*_FACTORS, *(1 / _FACTORS)]
-    results = [least([(1.0, x) for x in _ANGLES]), least([(x, 0.0) for x in factors])]
-    _, (factor, offset) = min(results)
-    width, ratio = _ANGLES[1] - _ANGLES[0], 1.4
-    for _ in range(4):
-        width, ratio = width / 3, ratio ** (1 / 3)
-        pairs = [(factor, offset + width * x) for x in (-1, 0, 1)]
+    starts = []
+    for k in range(len(names)):
+        _, factor = min((left(k, x, 0.0), x) for x in _FACTORS)
+        starts.append(min((left(k, factor, x), k, factor, x) for x in _ANGLES))
+    for _, k, factor, offset in sorted(starts)[:_REFINED]:
+        name, fits = names[k], []
+        # A factor or an offset alone, if both explain no more.
+        for fixed in ((1.0, None), (None, 0.0), (None, None)):
+            free = [x is None for x in fixed]
+
+            def values(x: np.ndarray, free: list[bool] = free) -> tuple[float, float]:
+                both = np.array([0.0, 0.0])
+                both[free] = x
+                return float(np.exp(both[0])), float(both[1])
+
+            start = np.array([np.log(factor), offset])[free]
+            simplex = np.vstack([start, start + np.diag([0.15, 0.25])[free][:, free]])
+            options = {"maxfev": _TRIALS, "initial_simplex": simplex}
+            fit = scipy.optimize.minimize(
+                lambda x, k=k, values=values: left(k, *values(x)),
+                start,
+                method="Nelder-Mead",
+                options=options,
+            )
+            fits.append((fit.fun, *values(fit.x)))
+        least = min(x[0] for x in fits)
+        _, factor, offset = next(x for x in fits if x[0] <= max(_TIE * least, 1e-6))
+        parts = []
         if factor != 1.0:
-            pairs += [(factor * ratio, offset), (factor / ratio, offset)]
-        _, (factor, offset) = least(pairs)
-    parts = []
-    if factor != 1.0:
-        parts.append(
-            f"q and v of joint {name} are {factor:.3g} times those of the URDF, as by a gear"
-        )
-    if abs(offset) > width:
-        parts.append(
-            f"{name} is {-offset:.3g} off: add {offset:.3g} to its column, or correct the origin "
-            "of the joint"
-        )
-    return replace(changed(factor, offset), text=", and ".join(parts))
+            parts.append(
+                f"q and v of joint {name} are {factor:.3g} times those of the URDF, as by a gear"
+            )
+        if offset:
+            parts.append(
+                f"{name} is {-offset * factor:.3g} off: add {offset * factor:.3g} to its column, "
+                "or correct the origin of the joint"
+            )
+        yield replace(changed(k, factor, offset), text=", and ".join(parts))
 
 
 def _scaled(data: Averages, scale: np.ndarray) -> Averages:

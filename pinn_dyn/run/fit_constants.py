@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from pinn_dyn import evaluation
-from pinn_dyn.data import DataSource
+from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.evaluation.metrics import validation_error
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.identification.constants import (
@@ -24,11 +24,14 @@ from pinn_dyn.identification.constants import (
     common_factor,
     constants_table,
     contradicted,
+    far_masses,
     undetermined,
 )
 from pinn_dyn.identification.rigid_excitation import rigid_excitation
+from pinn_dyn.log_check.check import residual_figure
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
+from pinn_dyn.plots import save
 from pinn_dyn.run.build import ConfigError, naming
 from pinn_dyn.run.defaults import defaults, section
 from pinn_dyn.run.prepared import PreparedTraining
@@ -40,6 +43,8 @@ from pinn_dyn.wording import did_you_mean
 
 log = logging.getLogger(__name__)
 
+RESIDUALS = "residuals.png"
+"""File of the figure of residual forces in a run folder."""
 _SHOWN = 2  # directions in the log
 _MOVE = "Move {} at more frequencies, poses and speeds. excite.py designs such a motion."
 _NO_MOTION = (
@@ -123,6 +128,10 @@ def fit_constants(
     _write_log(training, truth, metrics, callbacks, loggers)
     runs = windows.splits.train
     write_constants(model, result, windows.source, training.folder, runs, solver.cutoff)
+    if isinstance(model, KnownMechanics) and isinstance(windows.source, LogSource):
+        figure = residual_figure(windows.source, double_copy(model).structure)
+        if figure is not None:
+            save(figure, training.folder / RESIDUALS)
     training.finish(record)
 
 
@@ -252,6 +261,8 @@ def write_constants(
         lines = undetermined(model, result)
         head = f"{len(lines)} of {len(table)} directions of the constants are held by the prior"
     conflicts = contradicted(model, result)
+    if isinstance(model, KnownMechanics) and not result.prior.mean.any():
+        conflicts += far_masses(table)
     path = folder / "undetermined.md"
     parts = [f"{head}.", "\n".join(f"- {x}" for x in lines), *conflicts, *remarks]
     write_whole(path, "\n\n".join(filter(None, parts)) + "\n")

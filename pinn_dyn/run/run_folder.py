@@ -36,7 +36,15 @@ RECORD, DATA, FINISHED = "record", "data", "finished"
 """Keys of a checkpoint: metrics of the training, identity of the data, end of the training."""
 _MOVED = "examples.cleaning_steps."
 REPLACE = "train into another folder, or replace the run by overwrite=True"
-_RESULTS = (CHECKPOINTS, "tensorboard", METRICS, "constants.csv", "undetermined.md", "payload.csv")
+_RESULTS = (
+    CHECKPOINTS,
+    "tensorboard",
+    METRICS,
+    "constants.csv",
+    "undetermined.md",
+    "residuals.png",
+    "payload.csv",
+)
 """Files and folders that only some trainings write."""
 
 log = logging.getLogger(__name__)

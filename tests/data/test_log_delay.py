@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from pinn_dyn.data.logs import InputDelay, Recording
+from pinn_dyn.data.logs import InputDelay, LogSource, Recording
 from pinn_dyn.log_check.delay import DelayCurve, clear_delays, input_delays
 from tests.support.delayed_robots import log, seven_regressor, sines
 
@@ -112,3 +113,32 @@ def test_the_hold_of_a_sample_is_no_delay(delay, spread, clear):
     d = step * np.arange(-2, 9)
     curve = DelayCurve(d, np.ones(len(d)), delay * step, spread * step, "inverse dynamics")
     assert clear_delays([curve], step) == pytest.approx([delay * step * clear])
+
+
+@pytest.mark.parametrize("delay", [0.013, 0.2])
+def test_runs_as_long_as_a_piece_load_with_a_delay(delay):
+    """The pieces lose the samples that the shift of the inputs drops, and no more."""
+    t = np.arange(401) / 100
+    runs = {
+        f"r{k}": pd.DataFrame({"t": t, "q": np.sin(t * (1 + k)), "u": np.cos(t * (2 + k))})
+        for k in range(4)
+    }
+    part = {"runs": 1, "piece": 4.0}
+
+    def loaded(lag):
+        source = LogSource(
+            files=runs,
+            time="t",
+            q={"columns": ["q"], "unit": "rad"},
+            u={"columns": ["u"], "unit": "Nm"},
+            validation=part,
+            test=part,
+            delay=lag,
+        )
+        splits = source.load()
+        return [x.duration for x in (*splits.validation, *splits.test)], source.report
+
+    lengths, report = loaded(delay)
+    assert lengths == pytest.approx([int((4.0 - delay) * 100 + 1e-6) / 100] * 2)
+    assert "as the input delay drops" in report
+    assert loaded(0.0)[0] == pytest.approx([4.0, 4.0])

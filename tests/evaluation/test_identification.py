@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ from pinn_dyn.identification.constants import (
     common_factor,
     constants_table,
     contradicted,
+    far_masses,
     undetermined,
 )
 from pinn_dyn.identification.rigid_excitation import rigid_excitation
@@ -164,6 +166,22 @@ def test_bodies_and_gains_that_data_move_far_from_their_prior_are_named():
     assert gain.startswith("the data move slide far from its prior, drive gain by 4.2 standard")
     later = fit.prior._replace(mean=fit.prior.mean + 1)
     assert not contradicted(model, replace(fit, prior=later))  # the prior is an earlier fit
+
+
+def test_masses_whose_interval_is_far_from_that_of_the_urdf_are_named():
+    names = ["mass of arm", "mass of hand", "mass of tool", "mass of base", "damping of arm"]
+    values = [1360.0, 4.0, 0.2, 3.5, 90.0]
+    table = pd.DataFrame({"name": names, "value": values, "start": 1.0})
+    width = np.array([20.0, 1.5, 0.05, 0.1, 1.0])
+    table = table.assign(low=table.value - width, high=table.value + width)
+    (text,) = far_masses(table)
+    assert [name for name in names if name in text] == [
+        "mass of arm",
+        "mass of tool",
+        "mass of base",
+    ]
+    assert "the mass of arm is 1.36e+03 kg (1.34e+03 to 1.38e+03), in the URDF 1 kg" in text
+    assert far_masses(table[table.name == "mass of hand"]) == []
 
 
 def test_the_common_factor_of_gains_is_that_of_their_mean(model):

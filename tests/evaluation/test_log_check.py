@@ -254,7 +254,7 @@ def test_the_figures_have_the_units_of_the_log_and_the_mean_of_the_residual():
     frame["u1"] += 2.0 * np.maximum(frame["q1"] - 1.0, 0)
     frame[["q1", "q2"]] *= 1000
     result = checked(frame, q=dict(columns=["q1", "q2"], unit="mm"))
-    figure = figures.residuals(result.motion, result.source.q, None)
+    figure = figures.residuals(result.motion, result.source.q, None, result.source.u)
     grid = np.reshape(figure.axes, (2, 2))
     assert [ax.get_xlabel() for ax in grid[0]] == ["q1 [mm]", "d/dt q1 [mm/s]"]
     x, mean = grid[0, 0].lines[1].get_data()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from pinn_dyn.data.logs import LogSource
 from pinn_dyn.log_check.check import check
-from pinn_dyn.log_check.runs import INERTIA, RESIDUAL
+from pinn_dyn.log_check.runs import HELD, INERTIA, RESIDUAL
 from pinn_dyn.log_check.structure import FIT, SCALE
 from pinn_dyn.systems import RigidChain
 from tests.support import delayed_robots, underactuated
@@ -161,6 +161,34 @@ def noisy(table):
         table[name] += 0.3 * table[name].std() * noise
 
 
+def speed_later(table):
+    table["u1"] = table["v1"].shift(-2).ffill()
+
+
+def stopped(seconds):
+    """Runs whose joints a brake holds in the middle, while the log shows torques."""
+    rows, frames = round(seconds * RATE), {}
+    for k, (name, table) in enumerate(arm_runs().items()):
+        middle = len(table) // 2 + 20 * k
+        held = table.iloc[[middle] * rows].assign(v1=0.0, v2=0.0, v3=0.0)
+        held[["u1", "u2", "u3"]] *= 2.0
+        parts = pd.concat([table[: middle + 1], held, table[middle + 1 :]], ignore_index=True)
+        frames[name] = parts.assign(t=np.arange(len(parts)) / RATE)
+    return frames
+
+
+def loaded_from(share):
+    """Runs in which a payload is picked up after a share of the time."""
+    frames, loaded = arm_runs(), arm_runs(load=1.6)
+    rows = {name: round(share * len(table)) for name, table in frames.items()}
+    return {k: pd.concat([x[: rows[k]], loaded[k][rows[k] :]]) for k, x in frames.items()}
+
+
+def scaled_and_shifted(table):
+    table["q2"] = 1.7 * table["q2"] + 0.4
+    table["v2"] *= 1.7
+
+
 def log_of(frames, q_unit="rad", u_unit="Nm"):
     columns = next(iter(frames.values())).columns
     q, v, u = ([x for x in columns if x.startswith(name)] for name in "qvu")
@@ -220,6 +248,17 @@ PLANTED = {
         ["'u2' is 0.02 t", "at the motor"],
     ),
     "spring": (lambda: arm_runs(spring=(8, 0, 0)), True, FIT, ["springs=['joint0']"]),
+    "brake": (lambda: stopped(0.5), False, HELD, ["and 5 more parts: the joints are held"]),
+    "long brake": (lambda: stopped(1.0), True, HELD, ["and 5 more parts: the joints are held"]),
+    "payload in half": (lambda: loaded_from(0.5), False, RESIDUAL, ["another payload"]),
+    "payload in a third": (lambda: loaded_from(0.67), True, RESIDUAL, ["another payload"]),
+    "later speed": (lambda: edited(speed_later), False, NEXT, ["speed of 'q1', 2 rows later"]),
+    "factor and offset": (
+        lambda: edited(scaled_and_shifted),
+        True,
+        FIT,
+        ["1.7 times", "joint1 is 0."],
+    ),
     "homing": (lambda: edited(shifted(1.0)), True, FIT, ["joint1 is", "off: add -"]),
 }
 

@@ -23,7 +23,7 @@ from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
 from pinn_dyn.data.logs.reading import Layout
 from pinn_dyn.data.logs.recording import Recording, Report
-from pinn_dyn.data.logs.splits import Part, default_split, split
+from pinn_dyn.data.logs.splits import Part, default_split, fitting, split
 from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.table import Request, Table
@@ -227,6 +227,8 @@ class LogSource(DataSource):
             recordings, self.validation, self.test, guard=self.guard, seed=self.seed, lead=lead
         )
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
+        self.validation = fitting(self.validation, parts["validation"], lead, report)
+        self.test = fitting(self.test, parts["test"], lead, report)
         pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
         limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
         cleaned = long_enough("splitting", cleaned, limits, report)

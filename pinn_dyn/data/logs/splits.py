@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from pinn_dyn.data.logs.columns import STRICT
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.source import SPLITS
 from pinn_dyn.wording import did_you_mean
 
@@ -72,6 +73,23 @@ def default_split(
         return Part(piece, runs=validation), Part(piece, runs=test), _GUARD
     part = Part(piece, seconds=max(_SHARE * shortest, piece))
     return part, part, min(_GUARD, 0.02 * shortest)
+
+
+def fitting(part: Part, stretches: Sequence[Recording], lead: float, report: Report) -> Part:
+    """Shorten the pieces of a part whose runs are as long as a piece, by the ``lead`` s they lose.
+
+    A shift of the inputs drops the beginning of each run.
+    """
+    longest = max(stretches, key=lambda item: item.duration)
+    if not lead or part.piece == "whole" or longest.duration - lead >= part.piece:
+        return part
+    step = float(np.median(np.diff(longest.t)))
+    piece = round(int((longest.duration - lead) / step + 1e-6) * step, 9)
+    if longest.duration < part.piece - 0.5 * step or piece <= 0:
+        return part
+    text = f"pieces of {piece:g} s instead of {part.piece:g} s, as the input delay drops {lead:g} s"
+    report.add("Splits", longest.place, text)
+    return replace(part, piece=piece)
 
 
 def split(

@@ -15,6 +15,8 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
 
+STATE = "distance of the input from a measured state"
+"""Name of the measurement of inputs that are no commands."""
 LOST = "share of steps over lost rows"
 """Name of the measurement of rows that a clock of row numbers does not miss."""
 _FACTORS = (0.8, 1.25)  # range of dq/dt over v without a warning
@@ -43,7 +45,7 @@ def check_inputs(training: list[Recording], q: Columns, u: Columns) -> list[Meas
             "controller can use it; log the command that is sent"
         )
         bad = distance < _COPY
-        measured = ("distance of the input from a measured state", name, distance)
+        measured = (STATE, name, distance)
         results.append(judged(*measured, f"above {_COPY:g} steps", bad, text, "stop"))
     return results
 
@@ -167,7 +169,7 @@ def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measure
     A clock of row numbers does not see them. The time that passes from row to row is that of all
     joints together, Δt = Σ v_j Δq_j / σ_j² / Σ v_j² / σ_j².
     """
-    passed = []
+    passed, inside = [], []
     for item in recordings:
         assert item.v is not None
         step = np.diff(item.t)[:, None]
@@ -175,10 +177,12 @@ def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measure
         noise = 1.4826 * np.median(np.abs(dq - expected), axis=0)
         noise = np.maximum(noise, 0.02 * np.sqrt((expected**2).mean(axis=0))).clip(min=1e-150)
         weight = ((expected / noise) ** 2).sum(axis=1)
+        moving = (np.abs(item.v) * np.median(step) > noise).any(axis=1)
         sure = weight > 1 / _SURE**2
+        inside.append((moving[1:] & moving[:-1])[sure])
         passed.append((dq * expected / noise**2).sum(axis=1)[sure] / weight[sure])
     times = np.concatenate(passed)
-    late = times > _LOST
+    late = (times > _LOST) & np.concatenate(inside)  # not at a stop by a brake
     whole = np.abs(times - times.round())[late] < 0.25
     lost, early = int(late.sum()), int((times < 2 - _LOST).sum())
     bad = lost >= 5 and lost > _OFTEN * early and whole.mean() > 0.8
