@@ -201,15 +201,13 @@ def _answers(
     names = list(dict.fromkeys(item.run for item in everything))
     if inputs > size:
         everything = [with_products(item) for item in everything]
-    widths = [
-        data.rows(~np.any([x.of(data) for x in odd], axis=0)) if odd else data
-        for data in averages_of_widths(everything, step)
-    ]
+    widths = averages_of_widths(everything, step)
+    if odd:
+        widths = [data.rows(~np.any([x.of(data) for x in odd], axis=0)) for data in widths]
     of_training = [data.rows(data.stretch < len(first)) for data in widths]
     curves = input_delays(first, longest=longest, rigid=rigid, widths=of_training)
-    results: list[Measurement] = []
     if not widths:
-        return _Answers(results, curves, [0.0] * inputs, [1] * inputs)
+        return _Answers([], curves, [0.0] * inputs, [1] * inputs)
     chosen = compared(widths)
     faults, curves, held = input_faults([of_training[k] for k in chosen], curves, source.u, rigid)
     states = {x.place for x in source.measurements if x.name == STATE and x.verdict == "stop"}
@@ -221,8 +219,7 @@ def _answers(
     data = [x.rows(x.stretch < len(first)) for x in late]
     of_robot = [] if structure is None else compare_structure(structure, data, source.u)
     wrong = {x.place for x in of_robot if x.name == FIT and x.verdict != "ok"}
-    if wrong and structure is not None:
-        # A wrong robot has wrong delays.
+    if wrong and structure is not None:  # whose delays are wrong, too
         pairs = zip(curves, structure.joint_names, strict=True)
         curves = [x.without(_WRONG) if j in wrong and x.of_bodies else x for x, j in pairs]
         clear = [0.0] * inputs if servo else clear_delays(curves, step)
@@ -235,10 +232,7 @@ def _answers(
     of_parts: list[Measurement] = []
     parts: list[Interval] = []
     if bad <= {SATURATED}:
-        of_parts, parts = check_rests(motions, names)
-    if bad <= {SATURATED} and not parts:
-        of_runs, parts = check_runs(motions, names, inverse=inputs <= size, exact=not wrong)
-        of_parts += of_runs
+        of_parts, parts = _odd_parts(motions, names, inverse=inputs <= size, exact=not wrong)
     if parts and not odd:
         again = _answers(source, training, others, step, longest, structure, servo, parts)
         saturated = any(x.name == SATURATED and x.verdict != "ok" for x in again.measurements)
@@ -246,19 +240,40 @@ def _answers(
             asked = {x.name for x in of_parts}
             kept = [x for x in again.measurements if x.name not in asked]
             return replace(again, measurements=of_parts + kept)
-    if not bad:
-        results += of_parts
-        if not any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok"):
-            results += check_signs(motions[0], source.u, curves, rigid)
-    results += faults
-    free = [False] * size if structure is None else _free(structure)
-    results += check_angles(late[0], source.q, free)
-    if source.v is not None:
-        results += check_velocity_lag(everything, source.q, source.v, step, late[0].width)
-    results += _inputs_measured(source, data[0], curves, clear)
-    results += of_robot
+    results = [] if bad else of_parts
+    reversed_inputs = {x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok"}
+    if not bad and True not in reversed_inputs:
+        results += check_signs(motions[0], source.u, curves, rigid)
+    results += faults + _coordinates_measured(source, everything, late[0], structure, step)
+    results += _inputs_measured(source, data[0], curves, clear) + of_robot
     driven = [driven_joint(data[0], i) for i in range(inputs)] if 0 < inputs < size else []
     return _Answers(results, curves, clear, held, motions[0], driven)
+
+
+def _odd_parts(
+    motions: Sequence[Motion | None], names: Sequence[str], *, inverse: bool, exact: bool
+) -> tuple[list[Measurement], list[Interval]]:
+    """Look for parts of runs in which joints are held, or else for any that do not fit."""
+    results, parts = check_rests(motions, names)
+    if not parts:
+        of_runs, parts = check_runs(motions, names, inverse=inverse, exact=exact)
+        results += of_runs
+    return results, parts
+
+
+def _coordinates_measured(
+    source: logs.LogSource,
+    parts: Sequence[logs.Recording],
+    data: Averages,
+    structure: Structure | None,
+    step: float,
+) -> list[Measurement]:
+    """Measure wraps of angles and the lag of velocities."""
+    free = [False] * len(source.q.columns) if structure is None else _free(structure)
+    results = check_angles(data, source.q, free)
+    if source.v is not None:
+        results += check_velocity_lag(parts, source.q, source.v, step, data.width)
+    return results
 
 
 def _regressor(structure: Structure | None, inputs: int) -> Regressor | None:
