@@ -27,6 +27,7 @@ from pinn_dyn.identification.constants import (
     undetermined,
 )
 from pinn_dyn.identification.rigid_excitation import rigid_excitation
+from pinn_dyn.identification.weak_joints import weak_joints
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.run.build import ConfigError, naming
@@ -123,7 +124,8 @@ def fit_constants(
     _write_log(training, truth, metrics, callbacks, loggers)
     runs = windows.splits.train
     write_constants(model, result, windows.source, training.folder, runs, solver.cutoff)
-    training.finish(record)
+    labels = windows.source.labels
+    training.finish(record, lambda: weak_joints(model, runs, solver.cutoff, labels))
 
 
 def _fitted(

@@ -49,7 +49,6 @@ _LEVEL = 0.95  # level of the one-sided test for a larger validation error
 _NOISE = 0.2  # largest relative difference of validation errors that may be noise
 _FEWEST_WINDOWS = 10
 _IMPROVED = 0.95  # of the validation error, from which longer windows follow
-_TOLERANCE = 1e-2  # smallest relative decrease of the cost by a step of rollouts
 _HELD = 1e3  # root of the precision of constants that are held
 _SATURATED = 0.01  # filtered share of saturated samples, from which a sample is left out
 _DIVERGED = 1e4  # residual of a diverged rollout
@@ -333,7 +332,7 @@ class LeastSquares:
         partitions = [times[:, None].expand_as(v)[moves], _speeds(v)[moves]]
         group, limit = max(len(q) / (2 * periods), 1.0), _CHEAP * self.evaluations
         result = self._solve(
-            IDENTIFICATION, model, prior, residuals, partitions, group, limit, 1e-6, robust=False
+            IDENTIFICATION, model, prior, residuals, partitions, group, limit, robust=False
         )
         with torch.no_grad():
             doubt = doubtful_units(*model.force_ratio(q, v, a), errors().std(0))
@@ -371,7 +370,6 @@ class LeastSquares:
             partitions,
             float(size[1]),
             self.evaluations,
-            _TOLERANCE,
             robust=self.loss == "soft_l1",
         )
 
@@ -384,7 +382,6 @@ class LeastSquares:
         partitions: Sequence[Tensor],
         group: float,
         limit: int,
-        tolerance: float,
         robust: bool,
     ) -> Fit:
         """Fit from the present z; ``group`` residuals count as one."""
@@ -397,7 +394,7 @@ class LeastSquares:
 
         with Progress(task, limit, "evaluations or fewer") as progress:
             try:
-                problem.minimize(limit, tolerance, report)
+                problem.minimize(limit, (2 * len(z)) ** 0.5, report)
             finally:
                 vector_to_parameters(problem.z, model.parameters())
         log.info("%s: residual %.4f after %d steps", task, problem.noise, problem.steps)
@@ -441,9 +438,8 @@ def _longer(trajectories: Sequence[Trajectory], windows: Windows) -> list[Window
     stride = round(float(windows.t[1] / trajectories[0].t.diff()[0]))
     longest, steps = max(len(item.t) for item in trajectories) // 2, 2 * (len(windows.t) - 1)
     count, drawn = len(windows) // 2, []
-    draw = partial(
-        draw_windows, list(trajectories), stride=stride, history=-float(windows.input.t[0]), seed=0
-    )
+    history = -float(windows.input.t[0])
+    draw = partial(draw_windows, list(trajectories), stride=stride, history=history, seed=None)
     while steps * stride <= longest and count >= _FEWEST_WINDOWS:
         drawn.append(draw(count=count, steps=steps).to(torch.device("cpu"), torch.float64))
         steps, count = 2 * steps, count // 2
