@@ -83,6 +83,9 @@ class LeastSquares:
        a stage lowers the validation error by 5 %, windows of twice the length and half the number
        follow.
 
+    A stage ends when a step lowers the cost by less than its standard deviation by the noise
+    (:meth:`~.gauss_newton.GaussNewton.minimize`).
+
     The kept stage is the last one whose validation error is not clearly larger than the smallest,
     since later stages fit what is predicted; windows longer than the given ones are kept only if
     the error is smaller. An error is clearly larger if it is 20 % larger, or if
