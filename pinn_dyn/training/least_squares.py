@@ -48,6 +48,7 @@ _SCALE = 100.0  # root of the prior precision of the last mass of a robot withou
 _LEVEL = 0.95  # level of the one-sided test for a larger validation error
 _NOISE = 0.2  # largest relative difference of validation errors that may be noise
 _FEWEST_WINDOWS = 10
+_EXACT = 1e-3  # tolerance of the inverse dynamics, whose steps are cheap
 _IMPROVED = 0.95  # of the validation error, from which longer windows follow
 _HELD = 1e3  # root of the precision of constants that are held
 _SATURATED = 0.01  # filtered share of saturated samples, from which a sample is left out
@@ -83,8 +84,8 @@ class LeastSquares:
        a stage lowers the validation error by 5 %, windows of twice the length and half the number
        follow.
 
-    A stage ends when a step lowers the cost by less than its standard deviation by the noise
-    (:meth:`~.gauss_newton.GaussNewton.minimize`).
+    A stage of rollouts ends when a step lowers the cost by less than its standard deviation by the
+    noise (:meth:`~.gauss_newton.GaussNewton.minimize`), that of the inverse dynamics later.
 
     The kept stage is the last one whose validation error is not clearly larger than the smallest,
     since later stages fit what is predicted; windows longer than the given ones are kept only if
@@ -335,7 +336,7 @@ class LeastSquares:
         partitions = [times[:, None].expand_as(v)[moves], _speeds(v)[moves]]
         group, limit = max(len(q) / (2 * periods), 1.0), _CHEAP * self.evaluations
         result = self._solve(
-            IDENTIFICATION, model, prior, residuals, partitions, group, limit, robust=False
+            IDENTIFICATION, model, prior, residuals, partitions, group, limit, _EXACT, robust=False
         )
         with torch.no_grad():
             doubt = doubtful_units(*model.force_ratio(q, v, a), errors().std(0))
@@ -373,6 +374,7 @@ class LeastSquares:
             partitions,
             float(size[1]),
             self.evaluations,
+            1.0,
             robust=self.loss == "soft_l1",
         )
 
@@ -385,9 +387,13 @@ class LeastSquares:
         partitions: Sequence[Tensor],
         group: float,
         limit: int,
+        tolerance: float,
         robust: bool,
     ) -> Fit:
-        """Fit from the present z; ``group`` residuals count as one."""
+        """Fit from the present z; ``group`` residuals count as one.
+
+        The tolerance is in units of the standard deviation of the cost by the noise.
+        """
         task = f"least squares, {stage}"
         z = parameters_to_vector(model.parameters()).detach()
         problem = GaussNewton(partial(_evaluate, model, residuals), z, prior, group, robust)
@@ -397,7 +403,7 @@ class LeastSquares:
 
         with Progress(task, limit, "evaluations or fewer") as progress:
             try:
-                problem.minimize(limit, (2 * len(z)) ** 0.5, report)
+                problem.minimize(limit, tolerance * (2 * len(z)) ** 0.5, report)
             finally:
                 vector_to_parameters(problem.z, model.parameters())
         log.info("%s: residual %.4f after %d steps", task, problem.noise, problem.steps)
