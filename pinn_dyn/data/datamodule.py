@@ -102,19 +102,19 @@ class DynamicsData:
         Raises:
             ValueError: on a batch larger than the number of windows.
         """
-        runs, stride, count = self.splits.train, self._samples, self.pairs
-        steps = self._window_steps
+        runs, stride, steps = self.splits.train, self._samples, self._window_steps
         starts = sum(max(len(x.t) - steps * stride, 0) for x in runs)
-        if self.pairs == "auto":
+        count = None if self.pairs == "all" else self.pairs
+        if count == "auto":
             samples = sum(len(x.t) for x in runs)
             count = min(max(samples // (steps * stride), _FEWEST_WINDOWS), _MOST_WINDOWS)
             self.batch_size = min(self.batch_size, count)
-        if count != "all" and 0 < starts < count:
+        if count is not None and 0 < starts < count:
             log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)
             count, self.batch_size = starts, min(self.batch_size, starts)
         windows = draw_windows(
             runs,
-            count=None if count == "all" else count,
+            count=count,
             steps=steps,
             stride=stride,
             seed=None if self.pairs == "auto" else self.seed,

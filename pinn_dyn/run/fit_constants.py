@@ -124,8 +124,8 @@ def fit_constants(
     _write_log(training, truth, metrics, callbacks, loggers)
     runs = windows.splits.train
     write_constants(model, result, windows.source, training.folder, runs, solver.cutoff)
-    labels = windows.source.labels
-    training.finish(record, lambda: weak_joints(model, runs, solver.cutoff, labels))
+    assert isinstance(model, LearnedConstants)
+    training.finish(record, partial(weak_joints, model, runs, solver.cutoff, windows.source.labels))
 
 
 def _fitted(
