@@ -170,12 +170,13 @@ def logs() -> str:
         data = task(log).query("model in @MODELS")
         runs = data.groupby("model")[LONG]
         spread = (runs.max() - runs.min()).replace(0, None)
-        duration = data["training_seconds"].groupby("model").mean()
+        seconds = data.reindex(columns=["processor_seconds", "training_seconds"]).bfill(axis=1)
+        duration = seconds.iloc[:, 0].groupby("model").mean()
         for row in grid(data, [SHORT, LONG, "error_mean", "torque_share"], digits=3):
             name = row[0].strip("`")
             row.insert(3, number(spread[name]))
             rows.append([log, *row, number(duration[name])])
-    head = ["log", "model", "0.1 s", "1 s", "spread", "open loop", "torque error", "training, s"]
+    head = ["log", "model", "0.1 s", "1 s", "spread", "open loop", "torque error", "processor, s"]
     return markdown(head, rows)
 
 

@@ -16,6 +16,7 @@ from pinn_dyn.mechanics import samples_of
 from pinn_dyn.models.statistics import Statistics
 
 _LONGEST_WINDOW = 40  # steps, of steps="auto"
+_FEWEST_WINDOWS, _MOST_WINDOWS = 150, 600  # of pairs="auto"
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +27,8 @@ class DynamicsData:
     Args:
         source: the source of the trajectories.
         pairs: number of training windows, or ``"all"`` windows of the trajectories, which are also
-            used if there are fewer.
+            used if there are fewer. ``"auto"`` is as many as cover the trajectories once, from 150
+            to 600, at equal distances.
         steps: steps H of a window; 1 gives the paper's transition pairs. ``"auto"`` is 40, or half
             of the longest trajectory if that is shorter.
         stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``, or
@@ -45,7 +47,7 @@ class DynamicsData:
         self,
         source: DataSource,
         *,
-        pairs: PositiveInt | Literal["all"] = 8000,
+        pairs: PositiveInt | Literal["all", "auto"] = 8000,
         steps: PositiveInt | Literal["auto"] = 1,
         stride: PositiveInt | str = 10,
         batch_size: PositiveInt = 256,
@@ -100,18 +102,22 @@ class DynamicsData:
         Raises:
             ValueError: on a batch larger than the number of windows.
         """
-        runs, stride, count = self.splits.train, self._samples, self.pairs
-        steps = self._window_steps
+        runs, stride, steps = self.splits.train, self._samples, self._window_steps
         starts = sum(max(len(x.t) - steps * stride, 0) for x in runs)
-        if count != "all" and 0 < starts < count:
+        count = None if self.pairs == "all" else self.pairs
+        if count == "auto":
+            samples = sum(len(x.t) for x in runs)
+            count = min(max(samples // (steps * stride), _FEWEST_WINDOWS), _MOST_WINDOWS)
+            self.batch_size = min(self.batch_size, count)
+        if count is not None and 0 < starts < count:
             log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)
             count, self.batch_size = starts, min(self.batch_size, starts)
         windows = draw_windows(
             runs,
-            count=None if count == "all" else count,
+            count=count,
             steps=steps,
             stride=stride,
-            seed=self.seed,
+            seed=None if self.pairs == "auto" else self.seed,
             coverage=self.coverage,
             history=self.history,
         )

@@ -146,11 +146,11 @@ def draw_windows(
     count: int | None,
     steps: int,
     stride: int,
-    seed: int,
+    seed: int | None,
     coverage: float = 0.0,
     history: float = 0.0,
 ) -> Windows:
-    """Draw windows at random starts, over all starts of all trajectories.
+    """Draw windows at random starts, or evenly, over all starts of all trajectories.
 
     With ``coverage`` c = 0 all starts are equally likely. With c > 0 their probabilities are
     ~ (d_k)^(c N), where d_k is the distance from q ``(N,)`` in units of its spread to its tenth
@@ -162,7 +162,7 @@ def draw_windows(
         count: number of windows B; None for a window at each start.
         steps: steps H of a window.
         stride: samples in a step.
-        seed: seed of the starts.
+        seed: seed of the starts; None takes starts at equal distances.
         coverage: c, from 0 to 1.
         history: time before each start over which q and u are kept, s. Before the earliest sample
             they are constant.
@@ -187,8 +187,10 @@ def draw_windows(
             f"{count} windows of {span} samples do not fit, the training trajectories have "
             f"only {total} starts: take fewer pairs, a shorter window or more data"
         )
-    generator = torch.Generator().manual_seed(seed)
-    if coverage > 0:
+    generator = torch.Generator().manual_seed(seed or 0)
+    if seed is None:
+        flat = ((torch.arange(count, dtype=torch.float64) + 0.5) * (total / count)).long()
+    elif coverage > 0:
         flat = _distinct(total, min(max(10 * count, 400_000), total), generator)
         parts = [item.q[past:][:n] for item, n in zip(trajectories, starts, strict=True)]
         q = torch.cat(parts)[flat]

@@ -33,9 +33,9 @@ _HEADERS = {
     _WINDOW: r"error, reset every \1 s",
     "torque_share": "torque error / spread",
     "residual_share": "residual force, share",
-    "window_(.*)s_within": r"errors in 95 % interval, reset every \1 s",
+    r"window_([\d.]*)s_within(_corrected)?": r"errors in 95 % interval, reset every \1 s",
     "pairs": "training pairs",
-    "training_seconds": "training [s]",
+    "processor_seconds": "processor [s]",
 }
 
 

@@ -53,7 +53,7 @@ _MODELS_ON_LOGS: dict[str, dict[str, Any]] = {
     "CoupledOscillators": {"trainer.steps": 1200, "trainer.validations": 8},
 }
 _LEAST_SQUARES = {"trainer.steps": 1, "trainer.validations": 1, "trainer.gradient_clip_val": None}
-_LEAST_SQUARES_ON_LOGS = {"data.pairs": 150, "data.batch_size": 150}
+_LEAST_SQUARES_ON_LOGS = {"data.pairs": "auto"}
 
 
 def defaults(model: str, *, on_log: bool, least_squares: bool = False) -> dict[str, Any]:

@@ -28,7 +28,7 @@ LONGEST = 5.0
 """Default horizon of longer trajectories, s."""
 THRESHOLDS = {"small": 0.01, "large": 0.1}
 """Thresholds of the valid prediction times, in the units of q."""
-_COLUMNS = ("pairs", "parameters", "training_seconds")
+_COLUMNS = ("pairs", "parameters", "training_seconds", "processor_seconds")
 
 
 def evaluate(

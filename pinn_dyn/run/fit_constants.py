@@ -28,6 +28,7 @@ from pinn_dyn.identification.constants import (
     undetermined,
 )
 from pinn_dyn.identification.rigid_excitation import rigid_excitation
+from pinn_dyn.identification.weak_joints import weak_joints
 from pinn_dyn.log_check.check import residual_figure
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
@@ -132,7 +133,8 @@ def fit_constants(
         figure = residual_figure(windows.source, double_copy(model).structure)
         if figure is not None:
             save(figure, training.folder / RESIDUALS)
-    training.finish(record)
+    assert isinstance(model, LearnedConstants)
+    training.finish(record, partial(weak_joints, model, runs, solver.cutoff, windows.source.labels))
 
 
 def _fitted(

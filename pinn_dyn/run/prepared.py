@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ import torch
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.evaluation.metrics import score
+from pinn_dyn.evaluation.baselines import ConstantVelocity
+from pinn_dyn.evaluation.metrics import BEST_BY, score
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
@@ -52,7 +53,8 @@ class PreparedTraining:
         identity: identity of the data.
         facts: name, seed, windows, software and hardware, for the record.
         folder: the run folder.
-        start: time at which the training started, without interruptions, s.
+        start, processor_start: times at which the training started, without interruptions, of the
+            clock and of the processor, s.
     """
 
     model: Predictor
@@ -63,6 +65,7 @@ class PreparedTraining:
     facts: dict[str, Any]
     folder: Path
     start: float
+    processor_start: float
 
     def record(self, steps: int, validation: Mapping[str, Any], **facts: Any) -> dict[str, Any]:
         """Return the record of a training of some steps, with the metrics of its model."""
@@ -71,6 +74,7 @@ class PreparedTraining:
             **facts,
             "parameters": sum(p.numel() for p in self.model.parameters()),
             "training_seconds": time.perf_counter() - self.start,
+            "processor_seconds": time.process_time() - self.processor_start,
             "steps": steps,
             "validation": {key: float(value) for key, value in validation.items()},
         }
@@ -81,14 +85,27 @@ class PreparedTraining:
         settings = {key: value for key, value in flat.items() if key.startswith(_COMPARED)}
         return {key: x if isinstance(x, (int, float)) else str(x) for key, x in settings.items()}
 
-    def finish(self, record: dict[str, Any]) -> None:
-        """Write the record of the last step, completed by the score of the model that is kept."""
+    def finish(self, record: dict[str, Any], reasons: Callable[[], Sequence[str]] = tuple) -> None:
+        """Write the record of the last step, completed by the score of the model that is kept.
+
+        A warning names a model that predicts no better than constant velocity, with the reasons.
+        """
         record = finish(self.folder, record)
         log.info(
             "%s seed %d: validation error over %s %s, after %.0f s of training, in %s",
             *(record["name"], record["seed"], self.validator, score(record)),
             *(record["training_seconds"], self.folder),
         )
+        still = ConstantVelocity(self.model.num_coordinates, self.model.num_inputs)
+        truth = stack_until(self.windows.splits.validation)
+        rival = self.validator(still, truth)[BEST_BY.removeprefix("val/")]
+        error = record["validation"].get(BEST_BY)
+        if error is not None and not error < rival:
+            log.warning(
+                "%s predicts the validation motions no better than constant velocity: "
+                "error_windowed is %.3g, expected less than %.3g%s",
+                *(record["name"], error, rival, "".join(f"; {text}" for text in reasons())),
+            )
 
 
 def prepare(
@@ -153,6 +170,7 @@ def prepare(
         facts={**facts, **provenance()},
         folder=folder,
         start=time.perf_counter() - saved.get(RECORD, {}).get("training_seconds", 0.0),
+        processor_start=time.process_time() - saved.get(RECORD, {}).get("processor_seconds", 0.0),
     )
 
 

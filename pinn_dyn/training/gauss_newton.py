@@ -13,7 +13,6 @@ from pinn_dyn.training.constants_fit import Prior
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first step
 _SMALLEST_NOISE = 1e-15
 _GOOD, _POOR = 0.75, 0.25  # actual over predicted decrease of the cost
-_NEGLIGIBLE = 0.1  # share of the tolerance: a smaller predicted decrease is no reason for a step
 _SCALE_STEPS = 20
 
 
@@ -61,18 +60,20 @@ class GaussNewton:
         self._move(z, self._residuals(z), _FIRST_NOISE)
 
     def minimize(self, limit: int, tolerance: float, report: Callable[[], None]) -> None:
-        """Step until a step decreases the cost by less than a share, or ``limit`` evaluations.
+        """Step until a step decreases the cost by less than a tolerance, or is expected to.
 
-        ``report`` is called after each evaluation.
+        The cost is minus twice the logarithm of a probability: at the true z, it exceeds the
+        minimum by chi^2 with P degrees of freedom, whose standard deviation is sqrt(2 P). No more
+        than ``limit`` evaluations are used, and ``report`` is called after each.
         """
         decrease = torch.inf
         while True:
             predicted = self._linearize()
-            if decrease < tolerance or predicted < _NEGLIGIBLE * tolerance * self._cost:
+            if min(decrease, predicted) < tolerance:
                 return
             decrease = 0.0
             while not decrease > 0:
-                if self.evaluations >= limit or predicted < _NEGLIGIBLE * tolerance * self._cost:
+                if self.evaluations >= limit or predicted < tolerance:
                     return
                 decrease, predicted = self._step()
                 report()
@@ -94,7 +95,7 @@ class GaussNewton:
     def _step(self) -> tuple[float, float]:
         """Move z by at most the radius if that decreases the cost.
 
-        Return the relative decrease of the cost, and the predicted decrease.
+        Return the decrease of the cost, and the predicted decrease.
         """
         change, largest = self._change(0.0), float(self._gradient.norm()) / self._radius
         if change.norm() > self._radius:
@@ -106,7 +107,6 @@ class GaussNewton:
         errors = self._residuals(z)
         predicted = float(-((2 * self._gradient + self._curvature * change) * change).sum())
         decrease, length = self._cost - self._cost_at(z, errors), float(change.norm())
-        share = decrease / self._cost
         if decrease > _GOOD * predicted:
             self._radius = max(self._radius, 2 * length)
         if decrease < _POOR * predicted:
@@ -114,7 +114,7 @@ class GaussNewton:
         if decrease > 0:
             self.steps += 1
             self._move(z, errors, torch.inf)
-        return share, predicted
+        return decrease, predicted
 
     def _change(self, damping: float) -> Tensor:
         return -self._gradient / (self._curvature + damping)

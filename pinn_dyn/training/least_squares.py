@@ -48,8 +48,8 @@ _SCALE = 100.0  # root of the prior precision of the last mass of a robot withou
 _LEVEL = 0.95  # level of the one-sided test for a larger validation error
 _NOISE = 0.2  # largest relative difference of validation errors that may be noise
 _FEWEST_WINDOWS = 10
+_EXACT = 1e-3  # tolerance of the inverse dynamics, whose steps are cheap
 _IMPROVED = 0.95  # of the validation error, from which longer windows follow
-_TOLERANCE = 1e-2  # smallest relative decrease of the cost by a step of rollouts
 _HELD = 1e3  # root of the precision of constants that are held
 _SATURATED = 0.01  # filtered share of saturated samples, from which a sample is left out
 _DIVERGED = 1e4  # residual of a diverged rollout
@@ -83,6 +83,9 @@ class LeastSquares:
        as in the increment loss. The first rollouts use a quarter of the steps of the windows. While
        a stage lowers the validation error by 5 %, windows of twice the length and half the number
        follow.
+
+    A stage of rollouts ends when a step lowers the cost by less than its standard deviation by the
+    noise (:meth:`~.gauss_newton.GaussNewton.minimize`), that of the inverse dynamics later.
 
     The kept stage is the last one whose validation error is not clearly larger than the smallest,
     since later stages fit what is predicted; windows longer than the given ones are kept only if
@@ -333,7 +336,7 @@ class LeastSquares:
         partitions = [times[:, None].expand_as(v)[moves], _speeds(v)[moves]]
         group, limit = max(len(q) / (2 * periods), 1.0), _CHEAP * self.evaluations
         result = self._solve(
-            IDENTIFICATION, model, prior, residuals, partitions, group, limit, 1e-6, robust=False
+            IDENTIFICATION, model, prior, residuals, partitions, group, limit, _EXACT, robust=False
         )
         with torch.no_grad():
             doubt = doubtful_units(*model.force_ratio(q, v, a), errors().std(0))
@@ -371,7 +374,7 @@ class LeastSquares:
             partitions,
             float(size[1]),
             self.evaluations,
-            _TOLERANCE,
+            1.0,
             robust=self.loss == "soft_l1",
         )
 
@@ -387,7 +390,10 @@ class LeastSquares:
         tolerance: float,
         robust: bool,
     ) -> Fit:
-        """Fit from the present z; ``group`` residuals count as one."""
+        """Fit from the present z; ``group`` residuals count as one.
+
+        The tolerance is in units of the standard deviation of the cost by the noise.
+        """
         task = f"least squares, {stage}"
         z = parameters_to_vector(model.parameters()).detach()
         problem = GaussNewton(partial(_evaluate, model, residuals), z, prior, group, robust)
@@ -397,7 +403,7 @@ class LeastSquares:
 
         with Progress(task, limit, "evaluations or fewer") as progress:
             try:
-                problem.minimize(limit, tolerance, report)
+                problem.minimize(limit, tolerance * (2 * len(z)) ** 0.5, report)
             finally:
                 vector_to_parameters(problem.z, model.parameters())
         log.info("%s: residual %.4f after %d steps", task, problem.noise, problem.steps)
@@ -441,9 +447,8 @@ def _longer(trajectories: Sequence[Trajectory], windows: Windows) -> list[Window
     stride = round(float(windows.t[1] / trajectories[0].t.diff()[0]))
     longest, steps = max(len(item.t) for item in trajectories) // 2, 2 * (len(windows.t) - 1)
     count, drawn = len(windows) // 2, []
-    draw = partial(
-        draw_windows, list(trajectories), stride=stride, history=-float(windows.input.t[0]), seed=0
-    )
+    history = -float(windows.input.t[0])
+    draw = partial(draw_windows, list(trajectories), stride=stride, history=history, seed=None)
     while steps * stride <= longest and count >= _FEWEST_WINDOWS:
         drawn.append(draw(count=count, steps=steps).to(torch.device("cpu"), torch.float64))
         steps, count = 2 * steps, count // 2

@@ -56,6 +56,25 @@ def test_seconds_of_a_log_give_the_constants(tmp_path):
     assert run.metrics["validation"]["val/error_mean"] < 0.02
 
 
+@pytest.mark.parametrize("is_useless", [False, True])
+def test_a_model_behind_constant_velocity_is_named(caplog, is_useless):
+    """A torque that is noise predicts no motion."""
+    log = short_log(6, 50)
+    if is_useless:
+        log["tau"] = np.random.default_rng(0).normal(scale=10, size=len(log))
+    pinn_dyn.fit(
+        log,
+        q="q",
+        v="v",
+        u="tau",
+        model=partial(KnownMechanics, structure=RigidChain(ROD)),
+        optimizer=LeastSquares(cutoff=8.0, rollouts=False),
+    )
+    warning = "predicts the validation motions no better than constant velocity"
+    assert (warning in caplog.text) == is_useless
+    assert ("probable cause: the noise of its torque" in caplog.text) == is_useless
+
+
 def test_a_fit_refuses_what_no_trainer_has_and_names_what_it_does_not_use(caplog):
     fit = partial(
         pinn_dyn.fit,

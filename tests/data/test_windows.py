@@ -250,6 +250,22 @@ def test_all_pairs_are_all_starts_once():
         make_data(pairs="all", batch_size=200).windows  # noqa: B018
 
 
+@pytest.mark.parametrize(("samples", "count"), [(40, 102), (700, 350), (2000, 600)])
+def test_automatic_pairs_cover_the_motions_once(samples, count):
+    """Between 150 and 600 windows of six samples, or all of a short log, whatever the seed."""
+    runs = [make_trajectory(k, samples=samples) for k in range(3)]
+    both = [make_data(pairs="auto", batch_size=128, seed=seed) for seed in (0, 1)]
+    for data in both:
+        data.source.splits = Splits(runs, runs[:1], runs[:1])
+    first, second = (data.windows for data in both)
+    assert len(first) == count
+    assert torch.equal(first.q, second.q)
+    numbers = [samples * run + k for run, k in origin(runs, first)]
+    gaps = np.diff(numbers)
+    assert gaps.max() <= 3 * samples / count + 7  # the last six samples of a run start no window
+    assert gaps.min() >= int(3 * (samples - 6) / count)
+
+
 def test_a_stride_in_time_is_the_same_at_any_rate():
     assert torch.equal(make_data(stride=f"{3e3 * STEP:g} ms").windows.t, make_data().windows.t)
     with pytest.raises(ValueError, match=r"stride is 0.001 s and the sample time"):

@@ -56,6 +56,32 @@ def test_the_limit_of_evaluations_ends_with_the_best_z():
     assert problem.noise < before
 
 
+def test_the_end_does_not_depend_on_the_number_of_equal_residuals():
+    """A cost of 40,000 residuals at the noise floor hides steps of many standard deviations."""
+    _, evaluate = exponential_problem(outliers=0)
+    zero = torch.zeros(3, dtype=torch.float64)
+    prior = Prior(zero, 1e-3 * torch.eye(3, dtype=torch.float64))
+
+    def repeated(z, derivative):
+        return evaluate(z, derivative).repeat_interleave(100, dim=0)
+
+    one, many, exact = (
+        GaussNewton(*x, robust=False)
+        for x in (
+            (evaluate, zero, prior, 1.0),
+            (repeated, zero, prior, 100.0),
+            (repeated, zero, prior, 1.0),
+        )
+    )
+    for problem in (one, many, exact):
+        problem.minimize(100, 2.0, lambda: None)
+    torch.testing.assert_close(many.z, one.z)
+    best = GaussNewton(evaluate, exact.z, prior, 1.0, robust=False)
+    best.minimize(100, 1e-12, lambda: None)
+    deviations = (exact.slopes @ (exact.z - best.z)).square().sum()
+    assert float(deviations) < 2.0
+
+
 @pytest.mark.parametrize("robust", [False, True])
 def test_the_weight_of_the_data_never_decreases(robust):
     """Larger residuals, as after a step to less likely constants, do not favor the prior."""
