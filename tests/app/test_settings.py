@@ -122,7 +122,7 @@ def test_all_mistakes_are_reported_at_once():
         composed("train", ["seed=x", "data.pairs=many"])
     assert str(caught.value).splitlines() == [
         "seed is 'x', expected a valid integer",
-        "data.pairs is 'many', expected a valid integer or 'all'",
+        "data.pairs is 'many', expected a valid integer or 'all' or 'auto'",
     ]
     with pytest.raises(ConfigError) as caught:
         composed("train", ["loss.hubber=1", "trainer.stpes=1"])

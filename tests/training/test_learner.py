@@ -127,26 +127,17 @@ def test_validation_figures_are_logged_by_name(tmp_path, data):
     assert seen == [(model, (1, 101, 2))]
 
 
-def test_each_members_gradient_is_clipped_by_its_own_norm():
+def test_a_gradient_is_clipped_by_its_norm():
     generator = torch.Generator().manual_seed(0)
-    gradients = [torch.randn(3, *shape, generator=generator) for shape in ((4, 5), (7,), ())]
-    for factor, gradient in zip((0.01, 1.0, 100.0), torch.arange(3), strict=True):
-        for item in gradients:
-            item[gradient] *= factor
-    expected = []
-    for member in range(3):
-        parameters = [torch.nn.Parameter(torch.zeros_like(item[member])) for item in gradients]
-        for parameter, item in zip(parameters, gradients, strict=True):
-            parameter.grad = item[member].clone()
+    for factor in (0.01, 1.0, 100.0):
+        gradients = [factor * torch.randn(x, generator=generator) for x in ((4, 5), (7,), ())]
+        parameters = [torch.nn.Parameter(torch.zeros_like(x)) for x in gradients]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient.clone()
         clip_grad_norm_(parameters, 0.5)
-        expected.append([parameter.grad for parameter in parameters])
-    found = clipped(torch.cat([item.reshape(3, -1) for item in gradients], -1), 0.5)
-    for member in range(3):
-        wanted = torch.cat([item.flatten() for item in expected[member]])
-        torch.testing.assert_close(found[member], wanted, rtol=1e-6, atol=0)
-    norms = found.norm(dim=-1)
-    assert norms[0] < 0.4
-    assert norms[1] == pytest.approx(0.5, rel=1e-4)
+        found = clipped(torch.cat([x.flatten() for x in gradients]), 0.5)
+        expected = torch.cat([x.grad.flatten() for x in parameters])
+        torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
 
 
 class Breaks(AccelerationMLP):
