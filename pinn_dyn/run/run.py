@@ -46,7 +46,7 @@ TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""
 
 Values = ArrayLike | Tensor
-_OF_ALL_MEMBERS = ("parameters", "training_seconds")  # metrics that add up
+_OF_ALL_MEMBERS = "parameters", "training_seconds", "processor_seconds"  # metrics that add up
 
 
 class TermArrays(NamedTuple):
