@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -404,9 +405,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=120, help="number of set points")
     parser.add_argument("--samples", type=int, default=500, help="states of the conditions")
     parser.add_argument("--gains", type=float, nargs=2, default=[200.0, 20.0], help="K_P and K_D")
-    low, high = [-0.25, -0.25, 0.5, -0.2, -0.2, 0.5], [0.25, 0.25, 1.0, 0.2, 0.2, 0.8]
-    parser.add_argument("--q-low", type=float, nargs="+", default=low, help="lower end of the box")
-    parser.add_argument("--q-high", type=float, nargs="+", default=high, help="its upper end")
+    box = "end of the box, the default has 80 percent of the data in each coordinate"
+    parser.add_argument("--q-low", type=float, nargs="+", help=f"lower {box}")
+    parser.add_argument("--q-high", type=float, nargs="+", help=f"upper {box}")
     parser.add_argument("--rate", type=float, default=20_000.0, help="rate of the loops, 1/s")
     parser.add_argument("--duration", type=float, default=2.0, help="length of the loops, s")
     parser.add_argument("--folder", type=Path, default=Path("stability"))
@@ -414,7 +415,9 @@ def main() -> None:
 
     run = pinn_dyn.load(args.run)
     learned, robot = double_copy(run.system), double_copy(run.source.system)
-    box = args.q_low, args.q_high
+    q = torch.cat([motion.q for motion in run.source.load().train]).double()
+    usual = [torch.from_numpy(np.quantile(q, level, axis=0)).tolist() for level in (0.1, 0.9)]
+    box = args.q_low or usual[0], args.q_high or usual[1]
     reference, starts, region = (
         RandomSetPoints(*box, count, seed)
         for count, seed in ((args.count, 0), (args.count, 1), (args.samples, 2))
