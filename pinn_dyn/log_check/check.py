@@ -241,8 +241,8 @@ def _answers(
             kept = [x for x in again.measurements if x.name not in asked]
             return replace(again, measurements=of_parts + kept)
     results = [] if bad else of_parts
-    reversed_inputs = {x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok"}
-    if not bad and True not in reversed_inputs:
+    negative = any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok")
+    if not bad and not negative:
         results += check_signs(motions[0], source.u, curves, rigid)
     results += faults + _coordinates_measured(source, everything, late[0], structure, step)
     results += _inputs_measured(source, data[0], curves, clear) + of_robot
