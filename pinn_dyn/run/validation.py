@@ -86,6 +86,8 @@ def _reported(value: Any, path: str = "") -> Iterator[None]:
 
 _CHANGED = {
     "delay": ": it is now dead_time in s",
+    "ensemble": ": train.py -m seed=0,1,2 trains several models, evaluate.py ensemble=true compares",
+    "member": ": give the run of one seed",
     "rate": "; a law in nearly continuous time is rate=20000",
     "stability": ": python examples/paper/proposition_1.py RUN writes the report",
     r"controllers\.\w+\.(law|observer)\.actuator": ": the limits of the loop are enough, remove it",

@@ -210,6 +210,7 @@ def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
         (["controllers.learned.terms=guess"], ["controllers.learned.terms", "guess", "truth"]),
         (["dead_time=-1"], ["dead_time", "-1"]),
         (["delay=2"], ["delay", "dead_time in s"]),
+        (["member=1"], ["member", "the run of one seed"]),
         (["+robot.mass=-1"], ["robot", "mass", "-1"]),
         (["rate=null"], ["rate", "20000"]),
         (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
