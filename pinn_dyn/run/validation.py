@@ -86,7 +86,7 @@ def _reported(value: Any, path: str = "") -> Iterator[None]:
 
 _CHANGED = {
     "delay": ": it is now dead_time in s",
-    "ensemble": ": train.py -m seed=0,1,2 trains several models, evaluate.py ensemble=true compares",
+    "ensemble": ": train.py -m seed=0,1,2 trains several, evaluate.py ensemble=true takes the mean",
     "member": ": give the run of one seed",
     "rate": "; a law in nearly continuous time is rate=20000",
     "stability": ": python examples/paper/proposition_1.py RUN writes the report",
