@@ -36,7 +36,7 @@ class Pendubot(RigidChain):
     def input_matrix(self, q):
         return super().input_matrix(q)[..., :1]
 
-    def _input_force(self, q, u):
+    def input_force(self, q, u):
         return torch.cat([u, torch.zeros_like(u)], -1)
 
 

@@ -120,7 +120,7 @@ class AdaptiveTracking(ModelBasedLaw):
         constants, lag, wanted = memory.split(sizes, dim=-1)
         tau = self._torque(q, v, reference, constants)
         u, _, report = self._input(q, v, tau, None, applied, constants)
-        missing = self.model._applied_force(q, v, wanted) - self.model._applied_force(q, v, applied)
+        missing = self.model.applied_force(q, v, wanted) - self.model.applied_force(q, v, applied)
         mass = self.model.mass_matrix(q) / self.period
         gain = torch.diag_embed(self.velocity_gain.to(q).expand(q.shape))
         lag = spd_solve(mass + gain, matvec(mass, lag) + missing)
@@ -182,8 +182,8 @@ class AdaptiveTracking(ModelBasedLaw):
         zero = torch.zeros_like(v)
         model = self.model
         # C(q, v) w by the polarization of C(q, v) v, whose symbols are symmetric in v and w.
-        coriolis = model._inertial_force(q, v + w, zero) - model._inertial_force(q, v - w, zero)
-        tau = model._inertial_force(q, zero, rate) + coriolis / 4 + model.potential_force(q)
+        coriolis = model.inertial_force(q, v + w, zero) - model.inertial_force(q, v - w, zero)
+        tau = model.inertial_force(q, zero, rate) + coriolis / 4 + model.potential_force(q)
         tau = tau + factor * model.dissipative_force(q, w) - offset
         if self.sizes[0]:
             tau = tau + matvec(self._regressor(q, v, w, rate), change)

@@ -110,9 +110,9 @@ class ModelBasedLaw(Stage):
             u = A.new_zeros(A[..., 0, :].shape) if tau is None else pseudo_inverse_times(A, tau)
         elif tau is None:
             u = model.typical_input(q)
-            A = jacobians(lambda x: model._applied_force(q, v, x), u)[1][0]
+            A = jacobians(lambda x: model.applied_force(q, v, x), u)[1][0]
         else:
-            tau = model._reachable_force(q, v, tau)
+            tau = model.reachable_force(q, v, tau)
             solution = model.solve_input(self.solver, q, v, tau, applied, all_steps=is_traced())
             u, A = solution.u, solution.J
         if feedback is not None:

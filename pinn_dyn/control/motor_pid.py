@@ -48,7 +48,7 @@ class MotorPID(Stage):
         model = self.model
 
         def force(q: Tensor, u: Tensor) -> Tensor:
-            return model._applied_force(q, torch.zeros_like(q), u) - model.potential_force(q)
+            return model.applied_force(q, torch.zeros_like(q), u) - model.potential_force(q)
 
         typical = model.typical_input(q)
         _, (stiffness, slope) = jacobians(force, q, typical)

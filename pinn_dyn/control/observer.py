@@ -123,12 +123,12 @@ class MomentumObserver:
         state = torch.cat([q, momentum], dim=-1)
         no_input = q.new_zeros(*q.shape[:-1], self.model.num_inputs)
         force = self.model.momentum_derivative(state, no_input)[..., q.shape[-1] :]
-        return momentum, force if self.rest is None else force + self.model._friction_force(v)
+        return momentum, force if self.rest is None else force + self.model.friction_force(v)
 
     def driven(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force that the input adds, ``(*batch, N)``."""
-        no_input = self.model._applied_force(q, v, torch.zeros_like(u))
-        return self.model._applied_force(q, v, u) - no_input
+        no_input = self.model.applied_force(q, v, torch.zeros_like(u))
+        return self.model.applied_force(q, v, u) - no_input
 
     def _friction_band(self, v: Tensor) -> list[Tensor]:
         """Return the least and the largest dry friction at v, ``(*batch, N)``; [] without rest."""
@@ -136,7 +136,7 @@ class MomentumObserver:
             return []
         forward, resting = (v > 0).to(v), v.abs() < self.rest
         shares = (torch.where(resting, end, forward) for end in (0.0, 1.0))
-        return [self.model._sliding_force(v, share) for share in shares]
+        return [self.model.sliding_force(v, share) for share in shares]
 
     def _change(
         self, disturbance: Tensor, residual: Tensor, period: float | Tensor, *friction: Tensor

@@ -61,7 +61,7 @@ def sharing(model: Any) -> Any:
         return repeated("derivative", model.state_derivative, x, u.unsqueeze(-2))
 
     def packed(q: Tensor, v: Tensor) -> Tensor:
-        mass, bias = model._mass_and_bias(q, v)
+        mass, bias = model.mass_and_bias(q, v)
         return torch.cat([mass.flatten(-2), bias], dim=-1)
 
     def mass_and_bias(q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,7 +69,7 @@ def sharing(model: Any) -> Any:
         return result[..., : n * n].unflatten(-1, (n, n)), result[..., n * n :]
 
     if isinstance(integrator, Sticking):
-        vars(shared).update(integrator=integrator, _mass_and_bias=mass_and_bias)
+        vars(shared).update(integrator=integrator, mass_and_bias=mass_and_bias)
     else:
         vars(shared).update(integrator=integrator, state_derivative=derivative)
     return shared

@@ -14,8 +14,8 @@ from pinn_dyn.mechanics.predictor import ContinuousPredictor
 class MechanicalTerms(ContinuousPredictor):
     """Terms of a :class:`~.system.MechanicalSystem`, without checks of shapes.
 
-    A subclass implements the four abstract terms. The ``_``-methods derive all other quantities by
-    automatic differentiation. A subclass with closed formulas may override them.
+    A subclass implements the four abstract terms. All other terms follow by automatic
+    differentiation. A subclass with closed formulas may override them.
     """
 
     input_affine: bool = True
@@ -45,35 +45,38 @@ class MechanicalTerms(ContinuousPredictor):
     def _potential_force(self, q: Tensor) -> Tensor:
         return torch.func.grad(lambda x: self.potential_energy(x).sum())(q)
 
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """Return M(q) a + C(q, v) v, with C(q, v) v = (dM/dt) v - d(v^T M v / 2)/dq."""
         mass, mass_rate = torch.func.jvp(self.mass_matrix, (q,), (v,))  # type: ignore[misc]
         return matvec(mass, a) + matvec(mass_rate, v) - self._kinetic_gradient(q, v)
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
         """Solve M(q) a + C(q, v) v + G(q) = force for a."""
-        mass, bias = self._mass_and_bias(q, v)
+        mass, bias = self.mass_and_bias(q, v)
         return spd_solve(mass, force - bias)
 
-    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    def mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Return M(q) and C(q, v) v + G(q)."""
-        bias = self._inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
+        bias = self.inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
         return self.mass_matrix(q), bias
 
-    def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
+    def damping_force(self, q: Tensor, v: Tensor) -> Tensor:
+        """Return D(q) v, ``(*batch, N)``."""
         return matvec(self.damping_matrix(q), v)
 
-    def _friction_force(self, v: Tensor) -> Tensor:
+    def friction_force(self, v: Tensor) -> Tensor:
+        """Return the dry friction F(v), ``(*batch, N)``."""
         return torch.zeros_like(v)
 
-    def _friction_slope(self, v: Tensor) -> Tensor:
+    def friction_slope(self, v: Tensor) -> Tensor:
+        """Return dF_i/dv_i, ``(*batch, N)``."""
         return torch.zeros_like(v)
 
-    def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
         """Return the friction of coordinates that slide forward in a ``share`` of the time."""
-        return self._friction_force(v)
+        return self.friction_force(v)
 
-    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
+    def stiffness_matrix(self, q: Tensor) -> Tensor | None:
         """Return stiff terms K(q) of dG/dq, ``(*batch, N, N)``, or None, for implicit methods."""
         return None
 
@@ -81,17 +84,19 @@ class MechanicalTerms(ContinuousPredictor):
         """Return the inputs beyond which the drives give no more force, ``(M,)``, or None."""
         return None
 
-    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
+    def input_force(self, q: Tensor, u: Tensor) -> Tensor:
+        """Return A(q) u, ``(*batch, N)``."""
         return matvec(self.input_matrix(q), u)
 
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         return torch.zeros_like(v)
 
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        force = self._input_force(q, u)
+    def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return the force of the inputs and the residual force, ``(*batch, N)``."""
+        force = self.input_force(q, u)
         return force + self._residual_force(q, v, u) if self.has_residual else force
 
-    def _reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
+    def reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
         """Return the force closest to tau that an input gives, ``(*batch, N)``."""
         return tau
 
@@ -110,7 +115,7 @@ class MechanicalTerms(ContinuousPredictor):
         """Return d(v^T M(q) v / 2)/dq at fixed v."""
         return torch.func.grad(lambda x: 0.5 * (v * matvec(self.mass_matrix(x), v)).sum())(q)
 
-    def _resistance(self, q: Tensor, step: Tensor) -> Tensor:
+    def resistance_matrix(self, q: Tensor, step: Tensor) -> Tensor:
         """Return D + s K, ``(*batch, N, N)``."""
-        damping, stiffness = self.damping_matrix(q), self._stiffness_matrix(q)
+        damping, stiffness = self.damping_matrix(q), self.stiffness_matrix(q)
         return damping if stiffness is None else damping + step * stiffness

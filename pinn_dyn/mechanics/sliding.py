@@ -59,15 +59,15 @@ class Sliding:
         self._v = v
         inertia, force = self._mass_and_force(q, v, inputs[0])
         self._first: tuple[Tensor, Tensor] | None = (inertia, force)
-        mean, first = (system._applied_force(q, v, u) for u in (inputs.mean(0), inputs[0]))
+        mean, first = (system.applied_force(q, v, u) for u in (inputs.mean(0), inputs[0]))
         force = force + mean - first
         resistance = torch.zeros_like(inertia)
         if implicit:
-            resistance = system._resistance(q, h)
+            resistance = system.resistance_matrix(q, h)
             inertia = inertia + h * resistance
-            force = force + system._damping_force(q, v) - matvec(resistance, v)
+            force = force + system.damping_force(q, v) - matvec(resistance, v)
         at_rest, self.forward = v == 0, v > 0
-        friction = system._sliding_force(v, self.forward.to(v))
+        friction = system.sliding_force(v, self.forward.to(v))
         self.rate = _solve(inertia, force - friction, at_rest, 0 * v)
         self.stops = (v * self.rate < 0) & (v.abs() < h * self.rate.abs())
         time = -v / torch.where(self.stops, self.rate, 1.0)
@@ -76,8 +76,8 @@ class Sliding:
             can_stick = at_rest | self.stops
             moving = torch.where(can_stick, 0.0, v)
             force = force + matvec(resistance, v - moving)
-            upper = system._sliding_force(moving, torch.ones_like(v))
-            lower = system._sliding_force(moving, torch.zeros_like(v))
+            upper = system.sliding_force(moving, torch.ones_like(v))
+            lower = system.sliding_force(moving, torch.zeros_like(v))
             scale = inertia.diagonal(dim1=-2, dim2=-1)
             stuck, ahead = can_stick, self.forward
             for _ in range(_PASSES):
@@ -96,15 +96,15 @@ class Sliding:
         q, v = x.chunk(2, dim=-1)
         mass, force = self._first or self._mass_and_force(q, v, u)
         self._first = None
-        force = force - self.system._sliding_force(v, self.share)
+        force = force - self.system.sliding_force(v, self.share)
         return torch.cat([v, _solve(mass, force, self.stuck, -self._v / self.h)], dim=-1)
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
         """Return the function of :meth:`MechanicalSystem.implicit_solver` while the set holds."""
         q, _ = x.chunk(2, dim=-1)
         mass = self.system.mass_matrix(q)
-        inertia = mass + step * self.system._resistance(q, step)
-        stiffness = self.system._stiffness_matrix(q)
+        inertia = mass + step * self.system.resistance_matrix(q, step)
+        stiffness = self.system.stiffness_matrix(q)
 
         def solve(rate: Tensor) -> Tensor:
             rate_q, rate_v = rate.chunk(2, dim=-1)
@@ -131,9 +131,9 @@ class Sliding:
 
     def _mass_and_force(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return M and the force without dry friction."""
-        mass, bias = self.system._mass_and_bias(q, v)
-        applied = self.system._applied_force(q, v, u)
-        return mass, applied - bias - self.system._damping_force(q, v)
+        mass, bias = self.system.mass_and_bias(q, v)
+        applied = self.system.applied_force(q, v, u)
+        return mass, applied - bias - self.system.damping_force(q, v)
 
 
 def hold(matrix: Tensor, fixed: Tensor) -> Tensor:

@@ -54,25 +54,25 @@ class Sum(MechanicalSystem):
     input_matrix = _total("input_matrix")
     typical_input = _total("typical_input")
     _potential_force = _total("_potential_force")
-    _inertial_force = _total("_inertial_force")
-    _damping_force = _total("_damping_force")
-    _friction_force = _total("_friction_force")
-    _friction_slope = _total("_friction_slope")
-    _sliding_force = _total("_sliding_force")
-    _input_force = _total("_input_force")
-    _applied_force = _total("_applied_force")
+    inertial_force = _total("inertial_force")
+    damping_force = _total("damping_force")
+    friction_force = _total("friction_force")
+    friction_slope = _total("friction_slope")
+    sliding_force = _total("sliding_force")
+    input_force = _total("input_force")
+    applied_force = _total("applied_force")
     _residual_force = _total("_residual_force")
     _kinetic_gradient = _total("_kinetic_gradient")
     _momentum = _total("_momentum")
 
-    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        (mass, bias), *terms = (part._mass_and_bias(q, v) for part in self._systems())
+    def mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        (mass, bias), *terms = (part.mass_and_bias(q, v) for part in self._systems())
         for part_mass, part_bias in terms:
             mass, bias = mass + part_mass, bias + part_bias
         return mass, bias
 
-    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        matrices = [part._stiffness_matrix(q) for part in self._systems()]
+    def stiffness_matrix(self, q: Tensor) -> Tensor | None:
+        matrices = [part.stiffness_matrix(q) for part in self._systems()]
         stiff = [matrix for matrix in matrices if matrix is not None]
         return torch.stack(stiff).sum(0) if stiff else None
 

@@ -71,7 +71,7 @@ class MechanicalSystem(MechanicalTerms):
     def dissipative_force(self, q: Tensor, v: Tensor) -> Tensor:
         """Return D(q) v + F(v), ``(*batch, N)``; its power v^T D v + v^T F(v) is never negative."""
         self._check(q=q, v=v)
-        return self._damping_force(q, v) + self._friction_force(v)
+        return self.damping_force(q, v) + self.friction_force(v)
 
     @final
     def coriolis_matrix(self, q: Tensor, v: Tensor) -> Tensor:
@@ -98,14 +98,14 @@ class MechanicalSystem(MechanicalTerms):
     def forward_dynamics(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return M^-1 (A u + r - C v - G - D v - F), ``(*batch, N)``; paper eq. (armdynamics)."""
         self._check(q=q, v=v, u=u)
-        force = self._applied_force(q, v, u) - self.dissipative_force(q, v)
+        force = self.applied_force(q, v, u) - self.dissipative_force(q, v)
         return self._acceleration(q, v, force)
 
     @final
     def inverse_dynamics(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """Return tau = M a + C v + G + D v + F, ``(*batch, N)``, the force A u + r for ``a``."""
         self._check(q=q, v=v, a=a)
-        conservative = self._inertial_force(q, v, a) + self._potential_force(q)
+        conservative = self.inertial_force(q, v, a) + self._potential_force(q)
         return conservative + self.dissipative_force(q, v)
 
     @final
@@ -143,7 +143,7 @@ class MechanicalSystem(MechanicalTerms):
         all_steps: bool = False,
     ) -> Solution:
         """Return the input that gives the force tau ``(*batch, N)``, see :class:`InputSolver`."""
-        force = partial(self._applied_force, q, v)
+        force = partial(self.applied_force, q, v)
         return solver(force, tau, self.typical_input(q), previous, all_steps=all_steps)
 
     @final
@@ -187,7 +187,7 @@ class MechanicalSystem(MechanicalTerms):
     def power(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return dE/dt = v^T (A u + r) - v^T (D v + F), ``(*batch,)``, W: supply less losses."""
         self._check(q=q, v=v, u=u)
-        supplied = self._applied_force(q, v, u) - self.dissipative_force(q, v)
+        supplied = self.applied_force(q, v, u) - self.dissipative_force(q, v)
         return (v * supplied).sum(-1)
 
     @final
@@ -202,7 +202,7 @@ class MechanicalSystem(MechanicalTerms):
         q, p = x.chunk(2, dim=-1)
         self._check(q=q, p=p, u=u)
         grad_q, v = self._hamiltonian_gradient(q, p)
-        force = self._applied_force(q, v, u) - self.dissipative_force(q, v)
+        force = self.applied_force(q, v, u) - self.dissipative_force(q, v)
         return torch.cat([v, force - grad_q], dim=-1)
 
     @final
@@ -230,8 +230,8 @@ class MechanicalSystem(MechanicalTerms):
         q, v = x.chunk(2, dim=-1)
         if self.state == "qp":
             v = self._velocity(q, v)
-        mass, stiffness = self.mass_matrix(q), self._stiffness_matrix(q)
-        resistance = self._resistance(q, step) + torch.diag_embed(self._friction_slope(v))
+        mass, stiffness = self.mass_matrix(q), self.stiffness_matrix(q)
+        resistance = self.resistance_matrix(q, step) + torch.diag_embed(self.friction_slope(v))
         inverse = spd_solver(mass + step * resistance)
 
         def solve(rate: Tensor) -> Tensor:

@@ -99,7 +99,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         p = upper_solve(factor, w)
         return -self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
 
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """Return M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v and dW along v."""
         factor, bias, mass_rate_p = self._factor_and_rates(q, v)
         return upper_solve(factor, lower_solve(factor, a - mass_rate_p)) + bias

@@ -310,7 +310,7 @@ class KnownMechanics(LearnedConstants):
     def potential_energy(self, q: Tensor) -> Tensor:
         self._check(q=q)
         energy = self.structure.potential_energy(q, self.bodies())
-        return energy + ((0.5 * self._spring_force(q) - self.constant_force()) * q).sum(-1)
+        return energy + ((0.5 * self.spring_force(q) - self.constant_force()) * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
         rates = self.viscous()
@@ -329,19 +329,19 @@ class KnownMechanics(LearnedConstants):
     def typical_input(self, q: Tensor) -> Tensor:
         return super().typical_input(q) if self.servo is None else self.servo.typical_input(q)
 
-    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
+    def input_force(self, q: Tensor, u: Tensor) -> Tensor:
         if self.servo is not None:
             return self.servo.force(q, u)
         return (self.input_gain() * u) @ self.motors
 
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+    def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         if self.input_affine:
-            return self._input_force(q, u)
+            return self.input_force(q, u)
         if self.servo is None:
             return self.motor_force(q, v, u)
-        return self._input_force(q, u) + self.servo.excess(q, v, u)
+        return self.input_force(q, u) + self.servo.excess(q, v, u)
 
-    def _reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
+    def reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
         if self.limits is None:
             return tau
         far, speed = torch.full_like(tau @ self.motors.mT, torch.inf), v @ self.motors.mT
@@ -351,37 +351,37 @@ class KnownMechanics(LearnedConstants):
         )
         return tau.clamp(least, most)
 
-    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
+    def stiffness_matrix(self, q: Tensor) -> Tensor | None:
         springs = [torch.diag(x.springs()) for x in (self.servo, self.springs) if x is not None]
         springs += [] if self.elastic is None else [self.elastic.matrices()[0]]
         return torch.stack(springs).sum(0) if springs else None
 
-    def _spring_force(self, q: Tensor) -> Tensor:
+    def spring_force(self, q: Tensor) -> Tensor:
         """Return the part of G from servos, springs and elastic joints, ``(*batch, N)``."""
-        stiffness = self._stiffness_matrix(q)
+        stiffness = self.stiffness_matrix(q)
         return torch.zeros_like(q) if stiffness is None else q @ stiffness
 
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         force = self.structure.rigid_force(q, v, a, self.bodies(), gravity=False)
         return force + self.rotor_inertia() * a
 
     def _potential_force(self, q: Tensor) -> Tensor:
         zero = torch.zeros_like(q)
         gravity = self.structure.rigid_force(q, zero, zero, self.bodies(), gravity=True)
-        return gravity + self._spring_force(q) - self.constant_force()
+        return gravity + self.spring_force(q) - self.constant_force()
 
-    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    def mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
-        bias = bias + self._spring_force(q) - self.constant_force()
+        bias = bias + self.spring_force(q) - self.constant_force()
         return mass + torch.diag(self.rotor_inertia()), bias
 
-    def _friction_force(self, v: Tensor) -> Tensor:
+    def friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)
 
-    def _friction_slope(self, v: Tensor) -> Tensor:
+    def friction_slope(self, v: Tensor) -> Tensor:
         return self.friction.slope(v)
 
-    def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
         return self.friction.sliding(v, share)
 
 

@@ -99,15 +99,15 @@ class KnownAndNetwork(Sum):
         penalty = self.weight * share.square().mean()
         return penalty if self.residual is None else penalty + self.residual.penalty(q, v, u)
 
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        force = super()._applied_force(q, v, u)
+    def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        force = super().applied_force(q, v, u)
         return force if self.residual is None else force + self.residual(q, v, u)
 
     def largest_input(self) -> Tensor | None:
         return self.known.largest_input()
 
-    def _reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
-        return self.known._reachable_force(q, v, tau)
+    def reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
+        return self.known.reachable_force(q, v, tau)
 
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         return v.new_zeros(v.shape) if self.residual is None else self.residual(q, v, u)

@@ -72,12 +72,12 @@ class LagrangianNetwork(structured.StructuredNetwork):
     def mass_matrix(self, q: Tensor) -> Tensor:
         return self.mass.matrix(q)
 
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         factor, bias = self._factor_and_coriolis_force(q, v)
         root = self._root(factor)
         return matvec(root.transpose(-1, -2), matvec(root, a)) + bias
 
-    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    def mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         factor, bias = self._factor_and_coriolis_force(q, v)
         root = self._root(factor)
         return root.transpose(-1, -2) @ root, bias + self._potential_force(q)

@@ -53,11 +53,11 @@ class LearnedConstants(HasConstants, MechanicalSystem):
 
     def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force that the inputs exert on the joints, ``(*batch, N)``."""
-        return self._applied_force(q, v, u)
+        return self.applied_force(q, v, u)
 
     def missing_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return e, ``(*batch, N)``, the force that the input lacks for the acceleration."""
-        return self.inverse_dynamics(q, v, a) - self._applied_force(q, v, u)
+        return self.inverse_dynamics(q, v, a) - self.applied_force(q, v, u)
 
     def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return the spread of motor force / k over samples, ``(N,)``, or else of M a / k."""

@@ -92,15 +92,15 @@ class StructuredNetwork(MechanicalSystem):
         matrix = self.damping.matrix(q)
         return matrix + torch.diag(self.servo.damping_rates()) if self.servo else matrix
 
-    def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
+    def damping_force(self, q: Tensor, v: Tensor) -> Tensor:
         force = self.damping.product(q, v)
         return force + self.servo.damping_rates() * v if self.servo else force
 
-    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
+    def stiffness_matrix(self, q: Tensor) -> Tensor | None:
         return torch.diag(self.servo.springs()) if self.servo else None
 
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        force = super()._applied_force(q, v, u)
+    def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        force = super().applied_force(q, v, u)
         return force if self.input_affine or not self.servo else force + self.servo.excess(q, v, u)
 
     def input_matrix(self, q: Tensor) -> Tensor:
@@ -109,16 +109,16 @@ class StructuredNetwork(MechanicalSystem):
     def typical_input(self, q: Tensor) -> Tensor:
         return self.input.typical_input(q)
 
-    def _friction_force(self, v: Tensor) -> Tensor:
+    def friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)
 
-    def _friction_slope(self, v: Tensor) -> Tensor:
+    def friction_slope(self, v: Tensor) -> Tensor:
         return self.friction.slope(v)
 
-    def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
         return self.friction.sliding(v, share)
 
-    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
+    def input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.input.force(q, u)
 
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:

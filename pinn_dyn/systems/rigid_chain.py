@@ -223,8 +223,6 @@ class RigidChain(MechanicalSystem):
         bias = self._force(at, self._accelerations(at, v, None, self._gravity), bodies)
         return self._mass(at, bodies), bias
 
-    _mass_and_bias = mass_and_bias
-
     def rigid_force(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor | None = None, gravity: bool = True
     ) -> Tensor:
@@ -406,7 +404,7 @@ class RigidChain(MechanicalSystem):
     def _potential_force(self, q: Tensor) -> Tensor:
         return self.rigid_force(q, torch.zeros_like(q), torch.zeros_like(q))
 
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         return self.rigid_force(q, v, a, gravity=False)
 
     def _in_world(self, at: Kinematics, inertia: Tensor | None) -> Tensor:

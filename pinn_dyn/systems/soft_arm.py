@@ -165,7 +165,7 @@ class SoftArm(MechanicalSystem):
         jacobian, _, _ = self._chain(q)
         return self._potential_force_of(q, jacobian)
 
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         jacobian, bias, _ = self._chain(q, v)
         return matvec(self._gram(jacobian), a) + self._coriolis_force_of(jacobian, bias)
 

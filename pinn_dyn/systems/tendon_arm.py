@@ -123,15 +123,15 @@ class TendonArm(SoftArm):
         start = self.pretension / self.tendon_stiffness.to(q)
         return q @ self.routing.to(q).mT + self.spool * u + start
 
-    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
+    def input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return (self.tensions(q, 0.0) - self.tensions(q, u)) @ self.routing.to(q)
 
     def _potential_force_of(self, q: Tensor, jacobian: Tensor) -> Tensor:
         return super()._potential_force_of(q, jacobian) + self.tensions(q, 0.0) @ self.routing.to(q)
 
-    def _friction_force(self, v: Tensor) -> Tensor:
+    def friction_force(self, v: Tensor) -> Tensor:
         return self.friction.to(v) * (v / self.friction_speed.to(v)).tanh()
 
-    def _friction_slope(self, v: Tensor) -> Tensor:
+    def friction_slope(self, v: Tensor) -> Tensor:
         speed = self.friction_speed.to(v)
         return self.friction.to(v) / speed * (1 - (v / speed).tanh().square())

@@ -39,7 +39,7 @@ class LinearSystem(MechanicalSystem):
     def _potential_force(self, q: Tensor) -> Tensor:
         return 0.5 * q @ (self.stiffness + self.stiffness.mT)
 
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         return matvec(self.mass_matrix(q), a)
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:

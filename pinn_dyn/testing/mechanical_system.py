@@ -162,7 +162,7 @@ class MechanicalSystemContract:
     def test_inverse_dynamics_undoes_forward_dynamics(self, system, configurations):
         q, v, _, u = configurations
         a = system.forward_dynamics(q, v, u)
-        tau = system._applied_force(q, v, u)
+        tau = system.applied_force(q, v, u)
         if system.input_affine:
             assert_near(tau, product(system.input_matrix(q), u), self.exact_tolerance)
         scale = max(largest(tau), largest(system.potential_force(q)))
@@ -205,7 +205,7 @@ class MechanicalSystemContract:
         else:
             second, upper, lower = system.momentum(q, v), inverse, damping @ inverse
         zero = torch.zeros_like(mass)
-        springs = zero + (0.0 if (stiffness := system._stiffness_matrix(q)) is None else stiffness)
+        springs = zero + (0.0 if (stiffness := system.stiffness_matrix(q)) is None else stiffness)
         springs = inverse @ springs if system.state == "qv" else springs
         jacobian = torch.cat([torch.cat([zero, upper], -1), torch.cat([-springs, -lower], -1)], -2)
         step = torch.tensor(0.01, dtype=q.dtype)
@@ -216,7 +216,7 @@ class MechanicalSystemContract:
         q, v, a, _ = configurations
         arguments: dict[str, tuple[Tensor, ...]] = {
             "_potential_force": (q,),
-            **dict.fromkeys(("_inertial_force", "_acceleration"), (q, v, a)),
+            **dict.fromkeys(("inertial_force", "_acceleration"), (q, v, a)),
             **dict.fromkeys(("_momentum", "_kinetic_gradient"), (q, v)),
             **dict.fromkeys(("_hamiltonian_gradient", "_velocity"), (q, a)),
         }

@@ -154,7 +154,7 @@ def _stops_of(
         inverse @ torch.where(at_rest, 0.0, -y)
         for y in (slopes.by_state(*at), slopes.by_parameters(*at))
     )
-    upper, lower = (model._sliding_force(v, share + 0 * v) for share in (1.0, 0.0))
+    upper, lower = (model.sliding_force(v, share + 0 * v) for share in (1.0, 0.0))
     jump = (upper - lower) * (forward - motion.ahead[rows].to(v))
     columns = [y[rows] for y in (motion.stops, motion.stop, motion.rate)]
     values = [rows % size, *(y.unsqueeze(-1) for y in (*columns, jump)), kept, added]

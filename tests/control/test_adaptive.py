@@ -121,8 +121,8 @@ class Pulled(RigidChain):
 
     torques = torch.tensor([0.2, -0.1], dtype=torch.float64)
 
-    def _mass_and_bias(self, q, v):
-        mass, bias = super()._mass_and_bias(q, v)
+    def mass_and_bias(self, q, v):
+        mass, bias = super().mass_and_bias(q, v)
         return mass, bias - self.torques
 
 

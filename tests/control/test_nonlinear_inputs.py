@@ -78,13 +78,13 @@ def test_of_more_tendons_than_coordinates_the_input_of_least_norm_is_found():
     q, v, motion = arm_states()
     tau = arm.inverse_dynamics(q, v, motion.a)
     u = arm.input_for(q, v, motion.a)
-    assert_near(arm._input_force(q, u), tau, 1e-7)
+    assert_near(arm.input_force(q, u), tau, 1e-7)
     for _ in range(3):  # instants of a loop
         u = arm.solve_input(InputSolver(), q, v, tau, u).u
     for k in range(3):
 
         def force(x, k=k):
-            return arm._input_force(q[k], torch.from_numpy(x)).numpy()
+            return arm.input_force(q[k], torch.from_numpy(x)).numpy()
 
         expected = minimize(
             lambda x: x @ x,
@@ -108,7 +108,7 @@ def test_limits_of_the_input_are_kept_where_another_input_gives_the_force():
     assert not torch.equal(solution.u[inside], free[inside])
     assert solution.u.min() >= low
     assert solution.u.max() <= high
-    assert_near(arm._input_force(q, solution.u)[inside], tau[inside], 1e-7)
+    assert_near(arm.input_force(q, solution.u)[inside], tau[inside], 1e-7)
 
 
 def test_every_posture_that_taut_tendons_hold_has_an_input():
@@ -162,7 +162,7 @@ def test_the_feedback_passes_the_jacobian_at_the_solution(arm):
     feedback = 3.0 * (motion.q - q) + 0.5 * (motion.v - v)
     held = arm.input_for(q, 0 * v, 0 * v)
     for law, start in ((Regulation, held), (ProportionalDerivative, arm.typical_input(q))):
-        slopes = partial_derivatives(lambda u: arm._input_force(q, u), start, 1e-5)
+        slopes = partial_derivatives(lambda u: arm.input_force(q, u), start, 1e-5)
         u = call_of(law(arm, 3.0, 0.5), q, v, motion).u
         assert_near(u - start, (slopes.mT @ feedback[..., None])[..., 0], 1e-5)
 
@@ -177,9 +177,9 @@ def reachable_states():
 def test_the_solution_starts_from_the_last_input(monkeypatch):
     model, q, v, motion = reachable_states()
     law = Tracking(model, 1.0, 0.1)
-    evaluations, force = [], type(model)._applied_force
+    evaluations, force = [], type(model).applied_force
     monkeypatch.setattr(
-        type(model), "_applied_force", lambda *x: (evaluations.append(1), force(*x))[1]
+        type(model), "applied_force", lambda *x: (evaluations.append(1), force(*x))[1]
     )
     first = call_of(law, q, v, motion).u
     count = len(evaluations)

@@ -115,7 +115,7 @@ def test_limits_hold_on_both_sides_and_at_a_rate_above_that_of_the_plan():
 class Rough(Pendulums):
     """A pendulum with smooth Coulomb friction."""
 
-    def _friction_force(self, v):
+    def friction_force(self, v):
         return 0.8 * torch.tanh(v / 0.04)
 
 

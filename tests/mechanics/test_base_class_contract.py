@@ -21,10 +21,10 @@ class TestLinearSystem(MechanicalSystemContract):
 class SlidingMasses(LinearSystem):
     """Masses with dry friction, which a linear system does not have."""
 
-    def _friction_force(self, v):
+    def friction_force(self, v):
         return 0.8 * torch.tanh(v / 0.3)
 
-    def _friction_slope(self, v):
+    def friction_slope(self, v):
         return 0.8 / 0.3 * (1 - torch.tanh(v / 0.3) ** 2)
 
 

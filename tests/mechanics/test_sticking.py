@@ -34,7 +34,7 @@ class Rubbing(LinearSystem):
         self.forward_level = torch.as_tensor(forward, dtype=torch.float64)
         self.backward_level = torch.as_tensor(backward, dtype=torch.float64)
 
-    def _sliding_force(self, v, share):
+    def sliding_force(self, v, share):
         return share * self.forward_level - (1 - share) * self.backward_level
 
 
@@ -140,7 +140,7 @@ def test_order_against_an_event_driven_solution(build, order, method):
 def pushed(damping, method, h, u, v0=0.0, friction=None, stride=1):
     """States of a mass of 1 kg with a friction level of 1 N, at each ``stride``-th input."""
     system = Rubbing([1.0], [1.0], [[1.0]], [[0.0]], [[damping]], [[1.0]]).requires_grad_(False)
-    system._sliding_force = friction or system._sliding_force
+    system.sliding_force = friction or system.sliding_force
     system.integrator = Sticking(method())
     t = h * torch.arange(len(u), dtype=torch.float64)
     signal = Signal(t, torch.tensor(u, dtype=torch.float64)[:, None])
@@ -217,7 +217,7 @@ def test_without_friction_a_step_is_that_of_the_inner_method(method):
     """Stiff springs and dampers, in states whose velocities keep their signs."""
     system = two_links()
     system.forward_level, system.backward_level = torch.zeros(2, 2, dtype=torch.float64)
-    system._stiffness_matrix = lambda q: system.stiffness
+    system.stiffness_matrix = lambda q: system.stiffness
     x0 = torch.tensor([[0.01, -0.02, 3.0, 2.0], [0.0, 0.01, -2.0, 4.0]], dtype=torch.float64)
     t = torch.tensor([0.0, 0.3], dtype=torch.float64)
     signal = Signal(t, torch.tensor([[1.0, 0.3], [0.5, 0.8]]).double().expand(2, 2, 2))

@@ -58,8 +58,8 @@ def with_network(**heads):
 def test_a_sum_has_the_stiffness_of_both_parts():
     """Servos stiffen a joint, and the parts of a sum share their targets."""
     parts = [make_structured("lnn", input=Servo) for _ in range(2)]
-    matrices = [part._stiffness_matrix(torch.zeros(part.num_coordinates)) for part in parts]
-    total = Sum(dict(a=parts[0], b=parts[1]))._stiffness_matrix(torch.zeros(len(matrices[0])))
+    matrices = [part.stiffness_matrix(torch.zeros(part.num_coordinates)) for part in parts]
+    total = Sum(dict(a=parts[0], b=parts[1])).stiffness_matrix(torch.zeros(len(matrices[0])))
     assert_near(total, matrices[0] + matrices[1], 1e-9)
 
 
