@@ -31,7 +31,7 @@ class ModelBasedLaw(Stage):
     Inputs are infinite or NaN where A loses its rank.
 
     The force f(q, v, u) is not linear in u for tendons with motor positions as inputs, and for
-    servos that saturate. The solution u* of f(q, v, u*) = tau then replaces A^+ tau, and the
+    drives that saturate. The solution u* of f(q, v, u*) = tau then replaces A^+ tau, and the
     Jacobian J = df/du at u* replaces A. :class:`InputSolver` starts from the last input. If there
     is no u*, the law returns the last input and has the mark ``unreachable``.
     With a model equal to the plant, the force is tau + J J^T (K_P e + K_D de/dt) up to second order

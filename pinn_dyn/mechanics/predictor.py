@@ -112,8 +112,8 @@ class ContinuousPredictor(Predictor):
             [[A_d, B_d], [0, 1]] = expm(T [[A, B], [0, 0]])      with a sample time T: x_k+1, held u
 
         A and B describe deviations from an equilibrium (f = 0) or from a motion. The state is
-        (q, v), m or rad and m/s or rad/s, also of models that integrate (q, p). Inputs of servos
-        are targets; elastic joints have their motors in q. Dry friction enters by its slope at v,
+        (q, v), m or rad and m/s or rad/s, also of models that integrate (q, p). Inputs are
+        those of the drives; elastic joints have their motors in q. Dry friction enters by its slope at v,
         which is largest at v = 0.
 
         Args:

@@ -28,7 +28,7 @@ class Sliding:
         (a - a_free)^T M (a - a_free)/2 + sum over coordinates at rest of F_i(0, a_i > 0) a_i
 
     where a_free is the acceleration without friction at rest. For an ``implicit`` method, M is
-    replaced by M + h D + h^2 K, with the stiffness K of servos and elastic joints. An active-set
+    replaced by M + h D + h^2 K, with the stiffness K of drives and elastic joints. An active-set
     method with a fixed number of passes finds the coordinates that stick. Gradients are those of
     the step for the resulting set.
     Source: Moreau (1988), "Unilateral contact and dry friction in finite freedom dynamics";

@@ -223,7 +223,7 @@ class MechanicalSystem(MechanicalTerms):
 
             (q, v):  J = [[0, 1], [-M^-1 K, -M^-1 D']]     (q, p):  J = [[0, M^-1], [-K, -D' M^-1]]
 
-        D' = D + diag(dF_i/dv_i), and K is the stiffness of servos and elastic joints. With
+        D' = D + diag(dF_i/dv_i), and K is the stiffness of drives and elastic joints. With
         r = (r_q, r_v) or (r_q, r_p), r_p = M r_v and E = (M + s D' + s^2 K)^-1 that is
         k_v = E (r_p - s K r_q), k_p = M k_v and k_q = r_q + s k_v.
         """

@@ -8,6 +8,7 @@ from pinn_dyn.models.cholesky import (
     NetworkCholesky,
 )
 from pinn_dyn.models.drive_limits import DriveLimits
+from pinn_dyn.models.drives import Drives, TorqueDrives
 from pinn_dyn.models.elastic import ElasticJoints
 from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
@@ -55,6 +56,7 @@ __all__ = [
     "CoulombFriction",
     "CoupledOscillators",
     "DriveLimits",
+    "Drives",
     "ElasticJoints",
     "FixedCholesky",
     "FixedInput",
@@ -84,4 +86,5 @@ __all__ = [
     "Statistics",
     "Stribeck",
     "SubspaceEncoder",
+    "TorqueDrives",
 ]

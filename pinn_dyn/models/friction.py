@@ -11,6 +11,7 @@ from torch import Tensor
 from pinn_dyn.models.known_constants import HasConstants, Named
 from pinn_dyn.models.scales import Scales
 
+_NO_LOSS = -8.0  # z of a loss by load that is all but zero
 _SMALLEST_WIDTH = 0.01
 """In units of the typical speed. A jump in the force could not be integrated."""
 
@@ -39,6 +40,10 @@ class Friction(HasConstants, abc.ABC):
         The default is F(v), without a jump at v = 0.
         """
         return self(v)
+
+    def absent(self) -> dict[Tensor, float]:
+        """Return parameters z of an optional effect, with the values at which it is absent."""
+        return {}
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
         """Return the joint force after transmission losses, ``(*batch, N)``. By default none."""
@@ -201,6 +206,9 @@ class LoadDependent(AsymmetricCoulomb):
     def physical_constants(self) -> list[Named]:
         loss = self.odds.named()._replace(values=self._loss())
         return [*super().physical_constants(), loss]
+
+    def absent(self) -> dict[Tensor, float]:
+        return {self.odds.z: _NO_LOSS}
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
         return force - self._loss() * force.abs() * torch.tanh(v / self.width())

@@ -15,7 +15,10 @@ from pinn_dyn.models.scales import Scales
 
 
 class InputMatrix(nn.Module, abc.ABC):
-    """Input matrix A(q) ``(*batch, N, M)``. ``affine`` is true if A does not depend on u."""
+    """Input matrix A(q) ``(*batch, N, M)``. ``affine`` is true if A does not depend on u.
+
+    Drives may add springs and damping to the equation of motion. By default there are none.
+    """
 
     affine: bool = True
 
@@ -30,6 +33,30 @@ class InputMatrix(nn.Module, abc.ABC):
     def force(self, q: Tensor, u: Tensor) -> Tensor:
         """Return the generalized force A(q) u, ``(*batch, N)``."""
         return matvec(self(q), u)
+
+    def applied(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return the force without that of springs and damping, ``(*batch, N)``."""
+        return self.force(q, u)
+
+    def spring_energy(self, q: Tensor) -> Tensor | float:
+        """Return the energy of the springs of the drives, ``(*batch,)``."""
+        return 0.0
+
+    def spring_force(self, q: Tensor) -> Tensor | float:
+        """Return the slope of the energy of the springs of the drives, ``(*batch, N)``."""
+        return 0.0
+
+    def stiffness_matrix(self) -> Tensor | None:
+        """Return the stiffness of the drives, ``(N, N)``, or None."""
+        return None
+
+    def damping_matrix(self) -> Tensor | float:
+        """Return the damping of the drives, ``(N, N)``."""
+        return 0.0
+
+    def damping_force(self, v: Tensor) -> Tensor | float:
+        """Return the damping force of the drives, ``(*batch, N)``."""
+        return 0.0
 
     def typical_input(self, q: Tensor) -> Tensor:
         """Return a typical input of a force that is not linear in it, ``(*batch, M)``."""

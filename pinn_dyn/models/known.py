@@ -6,23 +6,25 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import torch
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.drive_limits import DriveLimits
+from pinn_dyn.models.drives import Drives, TorqueDrives
 from pinn_dyn.models.elastic import ElasticJoints, Springs
-from pinn_dyn.models.friction import LoadDependent, NoFriction
+from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.joint_springs import JointSprings
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.scales import Joint, Scales
-from pinn_dyn.models.servo import Servo
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structure import Structure
 from pinn_dyn.models.structured import FrictionHead
@@ -30,7 +32,6 @@ from pinn_dyn.models.structured import FrictionHead
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the ten inertial parameters of a body."""
 _GENERIC_SPREAD = 3.0
-_NO_LOSS = -8.0  # z of a loss by load that is all but zero
 
 
 class KnownMechanics(LearnedConstants):
@@ -48,10 +49,10 @@ class KnownMechanics(LearnedConstants):
     the typical torque f = k u, d ~ f/v, F ~ f, o ~ f, r ~ f/a. At a passive joint f is the rigid
     force of the initial bodies at typical states.
 
-    With servos (:class:`Servo`) the inputs are targets, and A u is the force of the servos. k is
-    their stiffness, and D contains their damping. With :class:`ElasticJoints` the coordinates are
-    link and motor angles, and the inputs drive the motors. With :class:`DriveLimits` or
-    :class:`LoadDependent` friction, the drives limit k u or lose a part of it.
+    Other drives (``input``) may add springs and damping: with :class:`~.servo.Servo` the inputs are
+    targets, and k is the stiffness. With :class:`ElasticJoints` the coordinates are link and motor
+    angles, and the inputs drive the motors. With :class:`DriveLimits` or
+    :class:`~.friction.LoadDependent` friction, the drives limit k u or lose a part of it.
 
     Args:
         statistics: scales of the data.
@@ -69,13 +70,14 @@ class KnownMechanics(LearnedConstants):
         integrator: the integration method; Rosenbrock if friction dominates inertia.
         driven_joints: names of the joints that the inputs drive, in the order of the inputs. The
             default is all joints, the motors of elastic joints, or none if the data have no inputs.
-        input: builder of the servos, if the inputs are targets; k is then ``input.stiffness``.
+        input: builder of other drives, such as servos, if the inputs are targets; k is then
+            ``input.stiffness``.
         springs: names of the joints with a linear spring to their parent (:class:`JointSprings`).
         limits: builder of the limits of the drives, if k u is a command that they may not reach.
 
     Raises:
         ValueError: if the structure has no rigid bodies or other joints than the data or the
-            springs, ``spread`` names other bodies, or servos have limits or losses besides.
+            springs, ``spread`` names other bodies, or other drives have limits or losses besides.
     """
 
     def __init__(
@@ -89,7 +91,7 @@ class KnownMechanics(LearnedConstants):
         gain_spread: NonNegativeFloat = 0.0,
         integrator: Integrator | None = None,
         driven_joints: Sequence[str] | None = None,
-        input: Callable[..., Servo] | None = None,
+        input: Callable[..., Drives] | None = None,
         springs: Sequence[str] = (),
         limits: Callable[..., DriveLimits] | None = None,
     ):
@@ -118,35 +120,26 @@ class KnownMechanics(LearnedConstants):
         largest = 100.0 if len(driven) > 1 else math.inf
         self._largest_ratio = 5.0 if spreads.median() <= 1 else largest
         gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
-        drives = None if input else gain * statistics.u_rms.double()
-        force = self._typical_forces(statistics, bodies, drives)
+        driven_force = None if input else gain * statistics.u_rms.double()
+        force = self._typical_forces(statistics, bodies, driven_force)
         joints = tuple(map(Joint, names, structure.turning))
         scales = Scales(statistics, force, named=joints, prior=True)
-        self.servo = input and input(scales, joints=self.driven)
-        if self.servo is not None:
-            gain = self.servo.strength().detach().double()
-            force = self.servo.typical_force(force)
-            scales = replace(scales, value=force)
-            self.input_affine = self.servo.affine
-        offsets = self._set_drives(statistics, scales, springs)
+        torque_drives = partial(TorqueDrives, gain=gain, gain_spread=gain_spread, limits=limits)
+        self.drives = (input or torque_drives)(scales, joints=self.driven)
+        force = self.drives.typical_force(force)
+        scales = replace(scales, value=force)
+        offsets = self._set_resistance(statistics, scales, springs)
         self.friction = friction(scales)
-        motors = replace(scales, named=tuple(joints[k] for k in self.driven))
-        self.limits = limits and limits(replace(motors, value=force[self.driven]))
-        if self.limits or self.friction.by_load:
-            if self.servo is not None:
-                raise ValueError("servos have their own model.input.limit: leave out model.limits")
-            self.input_affine = False
+        if input and (limits or self.friction.by_load):
+            raise ValueError("servos have their own model.input.limit: leave out model.limits")
+        self.input_affine = self.drives.affine and not self.friction.by_load
         self.sticking = self.friction.sticking
         self.integrator = with_friction(integrator, self.sticking)
         self.elastic = Springs(structure) if isinstance(structure, ElasticJoints) else None
-        self.gain: Constants | None = None
-        if gain_spread > 0 and self.servo is None:
-            units = [f"{joint.force}/u" for joint in motors.joints]
-            self.gain = motors.positive("drive gain", 1.0, gain, gain_spread, units)
-        self._set_buffers(gain, offsets, force)
+        self._set_buffers(offsets, force)
         self.float()
 
-    def _set_drives(
+    def _set_resistance(
         self, statistics: Statistics, scales: Scales, springs: Sequence[str]
     ) -> list[int]:
         """Set armatures, friction, offsets and springs; return the joints with an offset."""
@@ -170,13 +163,11 @@ class KnownMechanics(LearnedConstants):
         self.springs = JointSprings(scales, index) if springs else None
         return offsets
 
-    def _set_buffers(self, gain: Tensor, offsets: list[int], force: Tensor) -> None:
+    def _set_buffers(self, offsets: list[int], force: Tensor) -> None:
         unit = torch.eye(self.num_coordinates)
-        self.register_buffer("fixed_gain", gain.clone())
         self.register_buffer("motors", unit[self.driven], persistent=False)
         self.register_buffer("offset_joints", unit[offsets], persistent=False)
         self.register_buffer("typical_force", force, persistent=False)
-        self.fixed_gain: Tensor
         self.motors: Tensor
         self.offset_joints: Tensor
         self.typical_force: Tensor
@@ -204,10 +195,8 @@ class KnownMechanics(LearnedConstants):
         return self.input_gain() @ self.motors + (1 - self.motors.sum(0))
 
     def input_gain(self) -> Tensor:
-        """Return k of the driven joints, or the strength of their servos, ``(M,)``."""
-        if self.servo is not None:
-            return self.servo.strength()
-        return self.fixed_gain if self.gain is None else self.gain()
+        """Return k of the driven joints, or the strength of other drives, ``(M,)``."""
+        return self.drives.strength()
 
     def constant_force(self) -> Tensor:
         """Return o, or k_s q_0 of joints with a spring, ``(N,)``; 0 for other passive joints."""
@@ -231,46 +220,37 @@ class KnownMechanics(LearnedConstants):
         if self.elastic is not None:
             drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
         drives += self.friction.physical_constants()
-        drives += [] if self.gain is None else [self.gain.named()]
-        for part in (self.servo, self.springs, self.limits):
-            drives += [] if part is None else part.physical_constants()
+        drives += self.drives.physical_constants()
+        drives += [] if self.springs is None else self.springs.physical_constants()
         return constants + drives
 
     def body_parameters(self) -> Tensor:
         """Return the inertial parameters pi ``(n, 10)``, with M a + C v + G = Y(q, v, a) pi."""
         return self.structure.parameters_of(self.bodies())
 
+    @property
+    def gain(self) -> Constants | None:
+        """Learned drive gains, if any."""
+        return self.drives.gain
+
     def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return k u behind limits and losses, or the force of the servos, ``(*batch, N)``."""
-        if self.servo is not None:
-            return self.servo.torque(q, v, u) @ self.motors
-        force = self.input_gain() * u
-        if self.limits is not None:
-            force = self.limits(force, v @ self.motors.mT)
-        return self.friction.transmitted(v, force @ self.motors)
+        """Return the force of the drives after transmission losses, ``(*batch, N)``."""
+        return self.friction.transmitted(v, self.drives.motor_force(q, v, u))
 
     @property
     def identified_by_forces(self) -> bool:
-        if self.limits is not None and self.limits.learned:  # zero limits and bodies would fit
-            return False
-        return self.servo is None or self.servo.affine
+        return self.drives.identified_by_forces
 
     def largest_input(self) -> Tensor | None:
-        return None if self.limits is None else self.limits.at_rest() / self.input_gain()
+        return self.drives.largest_input()
 
     def absent_parameters(self) -> Tensor | None:
-        if not isinstance(self.friction, LoadDependent):
-            return None
-        odds = self.friction.odds.z
-        absent = [_NO_LOSS if x is odds else torch.nan for x in self.parameters()]
-        values = zip(self.parameters(), absent, strict=True)
-        return torch.cat([torch.full_like(x, value).flatten() for x, value in values]).detach()
+        absent = self.friction.absent()
+        values = [torch.full_like(x, absent.get(x, torch.nan)) for x in self.parameters()]
+        return parameters_to_vector(values) if absent else None
 
     def saturated(self, v: Tensor, u: Tensor) -> Tensor:
-        if self.limits is None:
-            return super().saturated(v, u)
-        limited = self.limits.saturated(self.input_gain() * u, v @ self.motors.mT)
-        return (limited.to(v) @ self.motors) > 0
+        return self.drives.saturated(v, u)
 
     def drive_force(
         self, q: Tensor, v: Tensor, a: Tensor, u: Tensor, share: Tensor | None = None
@@ -295,7 +275,9 @@ class KnownMechanics(LearnedConstants):
         initial = self.structure.rigid_force(q, v, a, self.bodies.start(), gravity=True)
         ratio = (fitted + self.rotor_inertia() * a).norm(dim=0) / initial.norm(dim=0)
         ratio = torch.where(initial.norm(dim=0) > 0, ratio, 1.0)  # a motor has no body
-        return ratio[self.driven] * self.fixed_gain / self.input_gain(), self._largest_ratio
+        return ratio[
+            self.driven
+        ] * self.drives.initial_strength / self.input_gain(), self._largest_ratio
 
     def slopes(self) -> KnownSlopes:
         return KnownSlopes(self)
@@ -313,51 +295,41 @@ class KnownMechanics(LearnedConstants):
         return energy + ((0.5 * self.spring_force(q) - self.constant_force()) * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        rates = self.viscous()
-        if self.servo is not None:
-            rates = rates + self.servo.damping_rates()
-        matrix = torch.diag(rates)
+        matrix = torch.diag(self.viscous()) + self.drives.damping_matrix()
         if self.elastic is not None:
             matrix = matrix + self.elastic.matrices()[1]
         return matrix.expand(*q.shape, -1)
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        if self.servo is not None:
-            return self.servo(q)
-        return (self.input_gain() * self.motors.mT).expand(*q.shape, -1)
+        return self.drives(q)
 
     def typical_input(self, q: Tensor) -> Tensor:
-        return super().typical_input(q) if self.servo is None else self.servo.typical_input(q)
+        return self.drives.typical_input(q)
 
     def input_force(self, q: Tensor, u: Tensor) -> Tensor:
-        if self.servo is not None:
-            return self.servo.force(q, u)
-        return (self.input_gain() * u) @ self.motors
+        return self.drives.force(q, u)
 
     def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        if self.input_affine:
-            return self.input_force(q, u)
-        if self.servo is None:
-            return self.motor_force(q, v, u)
-        return self.input_force(q, u) + self.servo.excess(q, v, u)
+        return self.friction.transmitted(v, self.drives.applied(q, v, u))
 
     def reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
-        if self.limits is None:
+        ends = self.drives.force_range(v)
+        if ends is None:
             return tau
-        far, speed = torch.full_like(tau @ self.motors.mT, torch.inf), v @ self.motors.mT
-        least, most = (
-            self.friction.transmitted(v, self.limits.reachable(x, speed) @ self.motors)
-            for x in (-far, far)
-        )
-        return tau.clamp(least, most)
+        least, largest = (self.friction.transmitted(v, force) for force in ends)
+        return tau.clamp(least, largest)
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        springs = [torch.diag(x.springs()) for x in (self.servo, self.springs) if x is not None]
-        springs += [] if self.elastic is None else [self.elastic.matrices()[0]]
-        return torch.stack(springs).sum(0) if springs else None
+        matrices = [
+            self.drives.stiffness_matrix(),
+            None if self.springs is None else torch.diag(self.springs.springs()),
+            None if self.elastic is None else self.elastic.matrices()[0],
+        ]
+        present = [matrix for matrix in matrices if matrix is not None]
+        return torch.stack(present).sum(0) if present else None
 
     def spring_force(self, q: Tensor) -> Tensor:
-        """Return the part of G from servos, springs and elastic joints, ``(*batch, N)``."""
+        """Return the part of G from drives, springs and elastic joints, ``(*batch, N)``."""
         stiffness = self.stiffness_matrix(q)
         return torch.zeros_like(q) if stiffness is None else q @ stiffness
 

@@ -79,7 +79,7 @@ class KnownSlopes(Slopes):
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
         # Constants of drives have an entry for each driven joint instead of each joint.
-        sides = dict.fromkeys(("armature", "gain", "limits", "servo"), self.model.motors)
+        sides = dict.fromkeys(("armature", "drives"), self.model.motors)
         sides["offset"] = self.model.offset_joints
         if self.model.springs is not None:
             sides["springs"] = self.model.springs.selection

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from pinn_dyn import wording
 from pinn_dyn.mechanics.arrays import listed
-from pinn_dyn.models.input_matrix import InputMatrix
-from pinn_dyn.models.known_constants import Constants, HasConstants
+from pinn_dyn.models.drives import Drives
+from pinn_dyn.models.known_constants import Constants
 from pinn_dyn.models.scales import Scales
 
 _START = 10.0  # initial k in units of the typical force over the spread of q
@@ -22,7 +22,7 @@ _SHARPNESS = 8  # the force is 0.92 of its limit where the linear law reaches th
 _BEYOND = 1e3  # ratio to the limit beyond which the force is constant
 
 
-class Servo(HasConstants, InputMatrix):
+class Servo(Drives):
     """Position servos with targets u, and optional feed-forward forces f::
 
         s = k (u - q) - d v + f,      tau = s / (1 + |s / L|^8)^(1/8)
@@ -47,10 +47,10 @@ class Servo(HasConstants, InputMatrix):
         ValueError: if the data do not have n or 2 n inputs.
     """
 
+    takes_targets = True
     stiffness: Constants | None
     damping: Constants | None
     limit: Constants | None
-    selection: Tensor
     error: Tensor
     fixed_stiffness: Tensor
     fixed_limit: Tensor
@@ -64,9 +64,8 @@ class Servo(HasConstants, InputMatrix):
         limit: PositiveFloat | Sequence[PositiveFloat] | Literal["learned"] | None = None,
         joints: Sequence[NonNegativeInt] | None = None,
     ):
-        super().__init__(scales)
-        size, inputs = self.shape
-        index = list(range(size)) if joints is None else list(joints)
+        super().__init__(scales, joints)
+        index, inputs = self.joints, self.shape[1]
         if inputs not in (len(index), 2 * len(index)):
             raise ValueError(
                 f"the data have {inputs} inputs, expected targets of {len(index)} joints, or "
@@ -74,7 +73,6 @@ class Servo(HasConstants, InputMatrix):
                 f"{wording.setting('dataset.u.columns')}, or "
                 f"{wording.setting('model.input.joints')}"
             )
-        self.register_buffer("selection", torch.eye(size)[index], persistent=False)
         data = scales.statistics
         force = scales.value.double()
         if not scales.prior:
@@ -94,7 +92,7 @@ class Servo(HasConstants, InputMatrix):
         build = partial(motors.positive, spread=spread or 1.5)
         self.stiffness = build("servo stiffness", 1.0, start, units=units) if spread > 0 else None
         self.damping = self.limit = None
-        self.affine = limit is None
+        self.affine = self.identified_by_forces = limit is None
         if not self.affine:
             units = [joint.damping for joint in motors.joints]
             rate = force / data.v_std[index]
@@ -107,27 +105,30 @@ class Servo(HasConstants, InputMatrix):
         self.register_buffer("error", (spread_of_q / _START).float(), persistent=False)
         self.register_buffer("fixed_limit", largest.expand(len(index)).clone())
         self.register_buffer("fixed_stiffness", start.float())
+        self.register_buffer("initial_strength", self.strength().detach().clone())
 
-    def gain(self) -> Tensor:
+    def spring_constant(self) -> Tensor:
         """Return k, ``(n,)``."""
         return self.fixed_stiffness if self.stiffness is None else self.stiffness()
 
     def strength(self) -> Tensor:
         """Return 1 / (1/k + e/L), ``(n,)``, the force by target error, with a typical error e."""
-        return self.gain() / (1 + self.gain() * self.error / self.largest_force())
+        return self.spring_constant() / (
+            1 + self.spring_constant() * self.error / self.largest_force()
+        )
 
     def springs(self) -> Tensor:
         """Return k of all coordinates, ``(N,)``; 0 for a coordinate without a servo."""
-        return self.gain() @ self.selection
+        return self.spring_constant() @ self.selection
 
     def damping_rates(self) -> Tensor:
         """Return d of all coordinates, ``(N,)``; 0 for a coordinate without a servo."""
-        rate = torch.zeros_like(self.gain()) if self.damping is None else self.damping()
+        rate = torch.zeros_like(self.spring_constant()) if self.damping is None else self.damping()
         return rate @ self.selection
 
     def forward(self, q: Tensor) -> Tensor:
         """Return A, ``(*batch, N, M)``."""
-        columns = self.gain()[:, None] * self.selection
+        columns = self.spring_constant()[:, None] * self.selection
         if self.shape[1] > len(columns):
             columns = torch.cat([columns, self.selection])
         return columns.mT.expand(*q.shape[:-1], -1, -1)
@@ -137,15 +138,30 @@ class Servo(HasConstants, InputMatrix):
         targets = q @ self.selection.mT
         return nn.functional.pad(targets, (0, self.shape[1] - targets.shape[-1]))
 
-    def torque(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return tau, ``(*batch, n)``."""
-        linear = self._linear_torque(q, v, u)
-        return linear if self.affine else self._limited(linear)
+    def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        return self._limited(self._linear_torque(q, v, u)) @ self.selection
 
-    def excess(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return tau - s on all coordinates, ``(*batch, N)``, which is not linear in the input."""
+    def spring_energy(self, q: Tensor) -> Tensor:
+        return 0.5 * (self.springs() * q * q).sum(-1)
+
+    def spring_force(self, q: Tensor) -> Tensor:
+        return self.springs() * q
+
+    def stiffness_matrix(self) -> Tensor:
+        return torch.diag(self.springs())
+
+    def damping_matrix(self) -> Tensor:
+        return torch.diag(self.damping_rates())
+
+    def damping_force(self, v: Tensor) -> Tensor:
+        return self.damping_rates() * v
+
+    def applied(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        force = self.force(q, u)
+        if self.affine:
+            return force
         linear = self._linear_torque(q, v, u)
-        return (self._limited(linear) - linear) @ self.selection
+        return force + (self._limited(linear) - linear) @ self.selection
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
         """Return a tenth of k times the spread of q, ``(N,)``, the force of a typical lag."""
@@ -155,7 +171,7 @@ class Servo(HasConstants, InputMatrix):
         """Return s, ``(*batch, n)``."""
         target, *feedforward = u.split(len(self.selection), dim=-1)
         side = self.selection.mT
-        torque = sum(feedforward, self.gain() * (target - q @ side))
+        torque = sum(feedforward, self.spring_constant() * (target - q @ side))
         return torque if self.damping is None else torque - self.damping() * (v @ side)
 
     def largest_force(self) -> Tensor:
@@ -163,6 +179,8 @@ class Servo(HasConstants, InputMatrix):
         return self.fixed_limit if self.limit is None else self.limit()
 
     def _limited(self, linear: Tensor) -> Tensor:
+        if self.affine:
+            return linear
         limit = self.largest_force()
         ratio = (linear / limit).clamp(-_BEYOND, _BEYOND)
         return limit * ratio / (1 + ratio**_SHARPNESS) ** (1 / _SHARPNESS)

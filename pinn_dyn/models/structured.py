@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, MechanicalSystem, State
@@ -17,7 +16,6 @@ from pinn_dyn.models.positivity import Positive
 from pinn_dyn.models.potential import NetworkPotential, Potential
 from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.scales import Scales
-from pinn_dyn.models.servo import Servo
 from pinn_dyn.models.statistics import Statistics
 
 CholeskyHead = Callable[[Scales], CholeskyFactor]
@@ -79,29 +77,21 @@ class StructuredNetwork(MechanicalSystem):
     def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
         return Scales(statistics, value, self.angles)
 
-    @property
-    def servo(self) -> Servo | None:
-        """The input head if inputs are targets of servos."""
-        return self.input if isinstance(self.input, Servo) else None
-
     def potential_energy(self, q: Tensor) -> Tensor:
-        energy = self.potential(q)
-        return energy + 0.5 * (self.servo.springs() * q * q).sum(-1) if self.servo else energy
+        return self.potential(q) + self.input.spring_energy(q)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        matrix = self.damping.matrix(q)
-        return matrix + torch.diag(self.servo.damping_rates()) if self.servo else matrix
+        return self.damping.matrix(q) + self.input.damping_matrix()
 
     def damping_force(self, q: Tensor, v: Tensor) -> Tensor:
-        force = self.damping.product(q, v)
-        return force + self.servo.damping_rates() * v if self.servo else force
+        return self.damping.product(q, v) + self.input.damping_force(v)
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        return torch.diag(self.servo.springs()) if self.servo else None
+        return self.input.stiffness_matrix()
 
     def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        force = super().applied_force(q, v, u)
-        return force if self.input_affine or not self.servo else force + self.servo.excess(q, v, u)
+        force = self.input.applied(q, v, u)
+        return force + self._residual_force(q, v, u) if self.has_residual else force
 
     def input_matrix(self, q: Tensor) -> Tensor:
         return self.input(q)
@@ -128,5 +118,4 @@ class StructuredNetwork(MechanicalSystem):
         return v.new_zeros(()) if self.residual is None else self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:
-        force = self.potential.gradient(q)
-        return force + self.servo.springs() * q if self.servo else force
+        return self.potential.gradient(q) + self.input.spring_force(q)

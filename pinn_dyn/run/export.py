@@ -153,24 +153,22 @@ def _export_robot(model: Predictor, path: Path) -> Path:
     model = double_copy(model)
     chain = chain.double()
     with torch.no_grad():
-        servo, offset = model.servo, model.offset() @ model.offset_joints
+        drives, offset = model.drives, model.offset() @ model.offset_joints
         stiffness, rest = 2 * [0 * offset]
         if model.springs is not None:
             stiffness, rest = model.springs.springs(), model.springs.rest_positions()
         limit = torch.full_like(offset, torch.inf)
-        if servo and not servo.affine:
-            limit[model.driven] = servo.largest_force()
-        if model.limits is not None:
-            limit[model.driven] = model.limits.at_rest()
-        springs, damping = (servo.springs(), servo.damping_rates()) if servo else 2 * [0 * offset]
-        drives = model.physical_constants()[_BODY_COLUMNS:]
+        if not drives.affine:
+            limit[model.driven] = drives.largest_force()
+        springs, damping = drives.springs(), drives.damping_rates()
+        constants_of_drives = model.physical_constants()[_BODY_COLUMNS:]
         fast = torch.full_like(model.viscous(), torch.inf)
         constants = RobotConstants(
             inertia=model.bodies(),
             armature=model.rotor_inertia(),
             damping=model.viscous(),
             friction=(model.friction(fast) - model.friction(-fast)) / 2,
-            gain=springs if servo else model.input_gain() @ model.motors,
+            gain=springs if drives.takes_targets else drives.strength() @ model.motors,
             bias=torch.stack([offset, -springs, -damping], dim=-1),
             limit=limit,
             stiffness=stiffness,
@@ -179,7 +177,7 @@ def _export_robot(model: Predictor, path: Path) -> Path:
                 f"Inertias, damping and friction identified by pinn_dyn {__version__}. Drives:",
                 *(
                     f"{name} = {float(value):.6g} {unit}"
-                    for part in drives
+                    for part in constants_of_drives
                     for name, unit, value in zip(*part[:3], strict=True)
                 ),
             ],

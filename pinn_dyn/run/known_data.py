@@ -43,7 +43,7 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
     changes: dict[str, Any] = {"structure": {"joints": matched.joints}}
     names = list(driven or matched.joint_names)
     key, units = _signals(source)[-1]
-    columns = list(units)  # of servos, maybe, targets and feed-forward forces
+    columns = list(units)  # targets may have feed-forward forces behind them
     columns = columns[: len(names)] if len(columns) == 2 * len(names) else columns
     inputs = joints_of(columns, names)
     if inputs is None:
@@ -146,10 +146,10 @@ def check_known(model: KnownMechanics, source: DataSource) -> None:
                 f"{name} has the order {', '.join(columns)}, and the model the joints "
                 f"{', '.join(expected)}: build it with joints={order} or driven_joints={order}"
             )
-    if model.gain is None and model.servo is None:
+    if model.gain is None and not model.drives.takes_targets:
         inputs = [
             f"{name} in {unit}"
-            for (name, unit), gain in zip(u.items(), model.fixed_gain.tolist(), strict=False)
+            for (name, unit), gain in zip(u.items(), model.input_gain().tolist(), strict=False)
             if unit not in ("", "N", "Nm") and gain == 1
         ]
         if inputs:
@@ -165,9 +165,9 @@ def warn_of_log(model: Any, source: DataSource) -> None:
     """Warn of what the check of the log finds: whether it contradicts itself or the URDF."""
     if not isinstance(source, LogSource):
         return
-    known = isinstance(model, KnownMechanics) and not model.servo
-    structure = double_copy(model).structure if known else None
-    is_limited = known and model.limits is not None
+    drives = model.drives if isinstance(model, KnownMechanics) else None
+    structure = double_copy(model).structure if drives and not drives.takes_targets else None
+    is_limited = drives is not None and drives.limited
     for text in verdict(source, structure):
         if not (is_limited and SATURATES in text):
             log.warning("%s: %s", source.name, text)

@@ -116,7 +116,7 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     """Return an MJCF of the bodies, joints and drives of a robot, without shapes.
 
     An actuator computes gain * ctrl plus the bias, so that ctrl is the input of the model. The
-    force of a servo has a hard limit. Equalities couple the joints that follow others.
+    force of an actuator has a hard limit. Equalities couple the joints that follow others.
     """
     file, tree = UrdfFile(robot.urdf), robot.tree
     names = {file.ends[name][1]: name for name in file.joints}

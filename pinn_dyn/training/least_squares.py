@@ -77,7 +77,7 @@ class LeastSquares:
        has no input, r is the error of the acceleration instead: zero bodies would have no error of
        the force at such a joint. Without any input, no common factor of the forces changes the
        motion, and the mass of the last body stays that of the prior. If the force is not linear
-       in the input, as for a servo that saturates, rollouts start from the prior: the force at
+       in the input, as for drives that saturate, rollouts start from the prior: the force at
        the filtered input is not the filtered force.
     2. Rollouts: r = predicted minus measured increments of the windows, in units of their spread,
        as in the increment loss. The first rollouts use a quarter of the steps of the windows. While

@@ -111,14 +111,14 @@ def test_a_servo_becomes_an_actuator_with_the_same_forces(tmp_path, limit):
     """At a fifth of the limit, and far beyond: in between, the limit of the model is smooth."""
     model = learned(TREE, ["wrist"], NoFriction, input=partial(Servo, limit=limit, stiffness=8.0))
     q, v, _ = states(len(model.driven))
-    largest = torch.inf if limit is None else model.servo.largest_force()
+    largest = torch.inf if limit is None else model.drives.largest_force()
     mjcf = mujoco.MjModel.from_xml_path(str(export(model, tmp_path / "arm.xml")))
     data = mujoco.MjData(mjcf)
     order = [mjcf.joint(name).id for name in model.structure.joint_names]
     drives = [mjcf.actuator(name).id for name in model.structure.joint_names]
     for size in (0.1, 1e3):
         s = size * (torch.ones_like(q) if limit is None else largest) * q.sign()
-        u = q + (s + model.servo.damping_rates() * v) / model.servo.gain()
+        u = q + (s + model.drives.damping_rates() * v) / model.drives.spring_constant()
         expected = s.clamp(-largest, largest) if limit else s
         expected = expected + model.constant_force()
         for k in range(STATES):

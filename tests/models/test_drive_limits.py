@@ -121,7 +121,7 @@ def test_limits_are_learned_from_rollouts(motions):
     assert table.value["torque limit of hinge"] == pytest.approx(LIMIT, rel=0.05)
     assert table.unit["no-load speed of hinge"] == "rad/s"
     force, v = torch.full((3, 1), 50.0), torch.tensor([[0.0], [5.5], [7.0]])
-    largest = model.limits(force, v)[:, 0].detach()
+    largest = model.drives.limits(force, v)[:, 0].detach()
     assert largest.tolist() == pytest.approx([hard(50.0, float(x)) for x in v], abs=0.25)
 
 

@@ -65,7 +65,7 @@ def test_a_known_limit_gives_the_scale_of_the_servos():
     scales = unit_scales(2)
     head = Servo(scales, limit=[3.0, 0.5])
     limits = torch.tensor([3.0, 0.5]).double()
-    assert_near(head.gain().double() * scales.statistics.q_std.double(), limits, 1e-5)
+    assert_near(head.spring_constant().double() * scales.statistics.q_std.double(), limits, 1e-5)
     assert_near(head.typical_force(torch.ones(2)).double(), limits / 10, 1e-5)
 
 
@@ -83,7 +83,7 @@ def test_the_force_is_that_of_a_position_actuator_with_a_limit(limit):
         data.qpos[0], data.ctrl[0] = q, u
         mujoco.mj_forward(robot, data)
         v = torch.zeros(1).double()
-        force = head.torque(torch.tensor([q]).double(), v, torch.tensor([u]).double())
+        force = head.motor_force(torch.tensor([q]).double(), v, torch.tensor([u]).double())
         assert float(force) == pytest.approx(data.qfrc_actuator[0], rel=2e-2)
 
 
@@ -110,7 +110,8 @@ def test_a_distant_target_pulls_with_the_limit(kind):
     q, v, _, _ = random_batch(n, n)
     far = [model.forward_dynamics(q, v, torch.full_like(q, u)) for u in (1e2, 1e6)]
     assert_near(far[0], far[1], 1e-6)
-    pull = model.servo.torque(q, v, torch.full_like(q, 1e2))
+    servo = model.drives if kind == "known" else model.input
+    pull = servo.motor_force(q, v, torch.full_like(q, 1e2))
     assert_near(pull, torch.full_like(q, 0.5), 1e-6)
     beyond = model.forward_dynamics(q, v, torch.full_like(q, 1e2)) + 1e3
     assert model.input_for(q, v, beyond).isnan().all(-1).all()  # no target gives that force
@@ -125,7 +126,7 @@ def test_an_implicit_step_is_stable_with_a_stiff_servo(kind):
         for x in (Rosenbrock(), None)
     ]
     for model in models:
-        model.servo.fixed_stiffness.fill_(1e6)
+        model.input.fixed_stiffness.fill_(1e6)
     t = torch.linspace(0, 1, 51).double()
     target = torch.tensor([0.3, -0.2]).double()
     x0 = torch.tensor([0.31, -0.2, 0.0, 0.0]).double()
@@ -137,11 +138,11 @@ def test_an_implicit_step_is_stable_with_a_stiff_servo(kind):
 def test_targets_are_in_the_order_of_their_joints():
     servo = make_structured(
         "lnn", 3, 2, input=partial(Servo, joints=[2, 0], stiffness=[4.0, 9.0], limit=1e6)
-    ).servo
+    ).input
     q, v, _, u = random_batch(3, 2)
-    (k, d), (k0, d0) = zip(servo.gain(), servo.damping(), strict=True)
-    pull = [k * (u[:, 0] - q[:, 2]) - d * v[:, 2], k0 * (u[:, 1] - q[:, 0]) - d0 * v[:, 0]]
-    assert_near(servo.torque(q, v, u), torch.stack(pull, dim=-1), 1e-6)
+    (k, d), (k0, d0) = zip(servo.spring_constant(), servo.damping(), strict=True)
+    pull = [k0 * (u[:, 1] - q[:, 0]) - d0 * v[:, 0], k * (u[:, 0] - q[:, 2]) - d * v[:, 2]]
+    assert_near(servo.motor_force(q, v, u)[:, [0, 2]], torch.stack(pull, dim=-1), 1e-6)
     assert_near(servo.springs(), torch.stack([k0, 0 * k, k]), 1e-6)
 
 
@@ -150,7 +151,7 @@ def test_typical_forces_and_units_follow_from_the_stiffness():
     head = Servo(unit_scales(2), stiffness=[20.0, 40.0], limit=4.0, spread=0)
     assert_near(head.typical_force(torch.ones(2)), torch.tensor([2.0, 4.0]), 1e-6)
     assert_near(head.strength(), 1 / torch.tensor([1 / 20 + 0.1 / 4, 1 / 40 + 0.1 / 4]), 1e-6)
-    constants = known_model(input=partial(Servo, limit="learned")).servo.physical_constants()
+    constants = known_model(input=partial(Servo, limit="learned")).drives.physical_constants()
     units = {
         name: unit for part in constants for name, unit in zip(part.names, part.units, strict=True)
     }
@@ -232,10 +233,10 @@ def test_targets_come_first_and_then_feed_forward_forces_in_the_order_of_the_joi
     )
     q = torch.tensor([0.1, 0.4, 0.3]).double()
     u = torch.tensor([0.5, -0.2, 3.0, 7.0]).double()
-    k = model.servo.gain().detach().double()
+    k = model.input.spring_constant().detach().double()
     expected = torch.stack([k[1] * (-0.2 - 0.1) + 7, 0 * k[0], k[0] * (0.5 - 0.3) + 3])
     at_rest = model.forward_dynamics(q, 0 * q, u) - model.forward_dynamics(q, 0 * q, 0 * u)
     force = model.mass_matrix(q) @ at_rest
     spring = torch.stack([-k[1] * 0.1, 0 * k[0], -k[0] * 0.3])
     assert_near(force + spring, expected, 1e-6)
-    assert_near(model.servo.torque(q, 0 * q, u), expected[[2, 0]], 1e-6)
+    assert_near(model.input.motor_force(q, 0 * q, u), expected, 1e-6)

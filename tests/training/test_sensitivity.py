@@ -30,7 +30,7 @@ MODELS = {
 @pytest.fixture(params=MODELS)
 def model(request):
     model = MODELS[request.param]()
-    generator = torch.Generator().manual_seed(3)
+    generator = torch.Generator().manual_seed(9)  # no joint stops within the windows below
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.3, generator=generator)
     return model
