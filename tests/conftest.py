@@ -95,8 +95,7 @@ def undrawn(monkeypatch):
     monkeypatch.setattr("pinn_dyn.log_check.check.LogCheck.save", lambda *_: "nowhere")
     evaluation = "pinn_dyn.evaluation"
     monkeypatch.setattr(f"{evaluation}.Evaluation.figures", lambda *_: iter(()))
-    page = f"{evaluation}.report.prediction_page.prediction_report"
-    monkeypatch.setattr(page, lambda *_: "")
+    monkeypatch.setattr(f"{evaluation}.Evaluation.page", lambda *_: "")
 
     def left_out(*_, **__):
         raise ValueError("left out")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         controller_comparison_figure,
         tip_path_figure,
     )
-    from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
+    from pinn_dyn.evaluation.evaluation import Entry, evaluate_models
     from pinn_dyn.evaluation.figures import (
         error_figure,
         sweep_figure,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         trajectory_figure,
     )
     from pinn_dyn.evaluation.log_figures import cleaning_figure
+    from pinn_dyn.evaluation.results import Evaluation
     from pinn_dyn.evaluation.rollout_figures import RolloutFigures
     from pinn_dyn.evaluation.validation import RolloutValidator
     from pinn_dyn.plots import save

@@ -20,7 +20,7 @@ from pinn_dyn.evaluation.metrics import (
     state_squared_error,
 )
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
-from pinn_dyn.evaluation.report.prediction_page import Evaluation
+from pinn_dyn.evaluation.results import Evaluation
 from pinn_dyn.evaluation.tables import (
     over_seeds,
 )

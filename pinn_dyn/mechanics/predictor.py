@@ -113,8 +113,8 @@ class ContinuousPredictor(Predictor):
 
         A and B describe deviations from an equilibrium (f = 0) or from a motion. The state is
         (q, v), m or rad and m/s or rad/s, also of models that integrate (q, p). Inputs are
-        those of the drives; elastic joints have their motors in q. Dry friction enters by its slope at v,
-        which is largest at v = 0.
+        those of the drives; elastic joints have their motors in q. Dry friction enters by its slope
+        at v, which is largest at v = 0.
 
         Args:
             q, v: ``(*batch, N)``.

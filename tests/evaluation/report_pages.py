@@ -19,7 +19,6 @@ from pinn_dyn.evaluation import (
 from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.report.control_page import control_report
 from pinn_dyn.evaluation.report.page import Origin
-from pinn_dyn.evaluation.report.prediction_page import prediction_report
 from pinn_dyn.mechanics import Predictor, Signal, Trajectory
 from pinn_dyn.progress import Progress
 
@@ -142,7 +141,7 @@ def prediction_page(names=("hnn", "lnn"), source=Source, **changes):
     item = evaluation(names, source)
     for name, value in changes.items():
         setattr(item, name, value)
-    return prediction_report(item, dict(item.figures()), 0), item
+    return item.page(dict(item.figures())), item
 
 
 def records(names=("learned", "pd"), runs=4):

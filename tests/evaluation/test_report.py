@@ -9,7 +9,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.report.page import slider
-from pinn_dyn.evaluation.report.prediction_page import prediction_report
 from pinn_dyn.identification.constants import COLUMNS
 from tests.evaluation.report_pages import (
     ODD,
@@ -29,7 +28,7 @@ def prediction():
 @pytest.fixture
 def empty_pictures(monkeypatch):
     """Pages with empty pictures of the trajectories, which take longer than all else."""
-    page = "pinn_dyn.evaluation.report.prediction_page"
+    page = "pinn_dyn.evaluation.results"
     monkeypatch.setattr(f"{page}.trajectory_figure", lambda *_, **__: Figure())
 
 
@@ -122,13 +121,13 @@ def test_the_slider_offers_the_median_and_the_worst_trajectories(prediction, mon
 
     _, page, item = prediction
     figures = dict(item.figures(2))
-    monkeypatch.setattr("pinn_dyn.evaluation.report.prediction_page.trajectory_figure", figure)
-    monkeypatch.setattr("pinn_dyn.evaluation.report.prediction_page.MAX_TRAJECTORIES", 3)
+    monkeypatch.setattr("pinn_dyn.evaluation.results.trajectory_figure", figure)
+    monkeypatch.setattr("pinn_dyn.evaluation.results.MAX_TRAJECTORIES", 3)
     pictures = [x["alt"] for tag, x in page.tags if tag == "img" and "alt" in x]
     assert [x for x in pictures if x.startswith("trajectory")] == [
         f"trajectory {k}" for k in range(5)
     ]
-    page = Page(prediction_report(item, figures, 2))
+    page = Page(item.page(figures, 2))
     lnn = item.models["lnn"].error().mean(dim=1)
     order = sorted(range(5), key=lambda k: (math.isnan(lnn[k]), float(lnn[k])))
     assert f"lnn: {order[2]}." in page.text.partition("Median")[2]
@@ -137,6 +136,17 @@ def test_the_slider_offers_the_median_and_the_worst_trajectories(prediction, mon
     assert len(drawn) == 3
     (control,) = [x for tag, x in page.tags if tag == "input"]
     assert sorted(drawn)[int(control["value"])] == 2
+
+
+def test_an_added_section_stands_behind_the_results(empty_pictures):
+    item = evaluation()
+    item.add_section("Load", ODD, pd.DataFrame({"mass [kg]": [2.5]}), Figure())
+    figures = dict(item.figures())
+    titles = [section.title for section in item.sections(figures)]
+    assert titles[-2:] == ["Load", "Configuration and provenance"]
+    page = Page(item.page(figures))
+    assert ODD in page.text
+    assert page.table("mass [kg]") == [{"mass [kg]": "2.5"}]
 
 
 @pytest.mark.slow
