@@ -31,7 +31,7 @@ from torch import Tensor
 from pinn_dyn.envs import ModelPlant, RobotEnv, RobotVectorEnv
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports import compiled
-from pinn_dyn.exports.exported import write
+from pinn_dyn.exports.exported_function import write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Signal, Trajectory, double_copy
 from pinn_dyn.models import KnownMechanics

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pinn_dyn.lazy import LazyNames, lazy_attributes
+from pinn_dyn.lazy_imports import LazyNames, lazy_attributes
 
 if TYPE_CHECKING:
     from pinn_dyn.app.config import dataset as dataset

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinn_dyn.whole import whole
+from pinn_dyn.atomic_files import whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

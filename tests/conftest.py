@@ -84,7 +84,7 @@ def traced(monkeypatch):
 @pytest.fixture
 def few_states(monkeypatch):
     """Compare an export with its original at ten states instead of 200."""
-    monkeypatch.setattr("pinn_dyn.exports.exported.STATES", 10)
+    monkeypatch.setattr("pinn_dyn.exports.exported_function.STATES", 10)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.control import ClosedLoopRecord, Helix, Reference
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
@@ -24,7 +25,6 @@ from pinn_dyn.evaluation.report.page import Origin
 from pinn_dyn.evaluation.tables import to_text, with_unit
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Drawable, HasTip
-from pinn_dyn.whole import write_whole
 
 
 def write_results(

@@ -19,8 +19,8 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pinn_dyn.run.program import program
-from pinn_dyn.workers import end_with_parent
+from pinn_dyn.run.command_line import program
+from pinn_dyn.worker_processes import end_with_parent
 
 log = logging.getLogger(__name__)
 

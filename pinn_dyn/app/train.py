@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
 from pinn_dyn.app.sweep import resume_command
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.evaluation.metrics import validation_error
 from pinn_dyn.run import training
 from pinn_dyn.run.build import ConfigError, build_part, build_source, model_builder
@@ -25,7 +26,6 @@ from pinn_dyn.run.run_folder import (
 )
 from pinn_dyn.run.trainer import tensorboard
 from pinn_dyn.run.trust import check_name, packages, require_trusted
-from pinn_dyn.whole import write_whole
 
 log = logging.getLogger(__name__)
 

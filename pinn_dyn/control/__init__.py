@@ -10,11 +10,11 @@ from pinn_dyn.control.latent_law import LatentLaw
 from pinn_dyn.control.laws import (
     ComputedTorque,
     ModelBasedLaw,
+    MotorPID,
     ProportionalDerivative,
     Regulation,
     Tracking,
 )
-from pinn_dyn.control.motor_pid import MotorPID
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.pipeline import Pipeline
 from pinn_dyn.control.plants import SimulatorPlant, SystemPlant

@@ -14,10 +14,9 @@ from pinn_dyn.data.robot_excitation import (
 )
 from pinn_dyn.data.simulated import InitialStates, SimulatedSource
 from pinn_dyn.data.simulation import SimulationError, simulate
-from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.data.stored import StoredSource, store
+from pinn_dyn.data.source import DataSource, Splits, StoredSource, store
 from pinn_dyn.data.windows import Windows, draw_windows
-from pinn_dyn.lazy import lazy_attributes
+from pinn_dyn.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from pinn_dyn.data.lightning_data import LightningData

@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import Field, PositiveInt
 from torch import Tensor
 
-from pinn_dyn.data.cache import Arrays
-from pinn_dyn.data.fingerprint import describe
+from pinn_dyn.data.cache import Arrays, describe
 from pinn_dyn.data.robot_excitation import DrawnMotion, RobotExcitation
 from pinn_dyn.data.simulated import RecordedSource, split_recordings, spread_samples
 from pinn_dyn.data.source import SPLITS

@@ -14,9 +14,8 @@ import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from pinn_dyn.data.cache import Arrays, load_or_make
+from pinn_dyn.data.cache import Arrays, describe, load_or_make
 from pinn_dyn.data.excitation import Excitation, InputSignal, picked_signals
-from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.simulation import SimulationError, momentum, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory

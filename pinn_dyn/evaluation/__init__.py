@@ -9,7 +9,7 @@ from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.metrics import RolloutMetrics, rollout_metrics
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
 from pinn_dyn.evaluation.torque import TorqueError, torque_error
-from pinn_dyn.lazy import lazy_attributes
+from pinn_dyn.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from pinn_dyn.evaluation.animation import animate

@@ -12,6 +12,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from pinn_dyn.atomic_files import whole
 from pinn_dyn.control import (
     Actuator,
     ClosedLoopRecord,
@@ -29,7 +30,6 @@ from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_m
 from pinn_dyn.evaluation.tables import write_table
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
 from pinn_dyn.systems import HasDomain, HasLimits, Stepped
-from pinn_dyn.whole import whole
 
 RATE = 1000.0
 """Default control instants per second, 1/s."""

@@ -11,6 +11,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation.calibration import Calibration
 from pinn_dyn.evaluation.figures import (
@@ -44,7 +45,6 @@ from pinn_dyn.evaluation.tables import (
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.modes import Modes
 from pinn_dyn.plots import save
-from pinn_dyn.whole import write_whole
 
 SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
 MAX_TRAJECTORIES = 20

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from pinn_dyn.whole import write_whole
+from pinn_dyn.atomic_files import write_whole
 
 MAX_COLUMNS = 9  # of a summary on a page and in the terminal; the CSV file has all
 SEEDS_COLUMNS = {

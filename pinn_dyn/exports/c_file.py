@@ -18,7 +18,7 @@ import torch
 
 from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.escaping import c_text
-from pinn_dyn.exports.exported import DTYPES, Calls, ExportedFunction, Real, identifier
+from pinn_dyn.exports.exported_function import DTYPES, Calls, ExportedFunction, Real, identifier
 from pinn_dyn.exports.program import Program
 from pinn_dyn.exports.scalar_code import CBody, c_function
 

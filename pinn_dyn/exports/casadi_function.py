@@ -17,7 +17,7 @@ from pinn_dyn.exports.program import MOVES, Program, moved, operation, unsupport
 if TYPE_CHECKING:
     import casadi
 
-    from pinn_dyn.exports.exported import Calls
+    from pinn_dyn.exports.exported_function import Calls
 
 # Elementwise operations with another name in CasADi, and with the same name.
 _NAMES = {"add": "plus", "sub": "minus", "mul": "times", "div": "rdivide", "pow": "power"}

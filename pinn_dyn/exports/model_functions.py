@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pinn_dyn.exports.exported import ExportedFunction, Ranges, drawn_states
+from pinn_dyn.exports.exported_function import ExportedFunction, Ranges, drawn_states
 from pinn_dyn.mechanics import ContinuousPredictor, MechanicalSystem, Predictor
 
 Outputs = Tensor | tuple[Tensor, ...]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, fx
 
-from pinn_dyn.exports.exported import DTYPES, Calls, ExportedFunction, Real
+from pinn_dyn.exports.exported_function import DTYPES, Calls, ExportedFunction, Real
 from pinn_dyn.exports.program import MOVES, moved, operation, unsupported
 
 OPSET = 18

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
+from pinn_dyn.atomic_files import read_regular
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.known import KnownMechanics
 from pinn_dyn.models.known_constants import Named, PositiveConstants
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.training.constants_fit import Fit, posterior_covariance
-from pinn_dyn.whole import read_regular
 
 CONSTANTS = "constants.csv"
 """File of the table of constants in a run folder."""

@@ -10,10 +10,10 @@ import yaml
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.identification.motion_limits import Envelope
 from pinn_dyn.identification.rigid_excitation import RigidExcitation
 from pinn_dyn.plots import COLORS, panels, save
-from pinn_dyn.whole import write_whole
 
 _MESSAGE_RATE = 20  # points per second: ros2_control interpolates, and a shell limits a message
 

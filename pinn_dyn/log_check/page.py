@@ -12,6 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from pinn_dyn import wording
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.evaluation.log_figures import cleaning_figure
@@ -29,7 +30,6 @@ from pinn_dyn.identification.rigid_excitation import RigidExcitation
 from pinn_dyn.log_check.delay import DelayCurve
 from pinn_dyn.log_check.figures import delay_curves, forces, residuals
 from pinn_dyn.log_check.runs import Motion
-from pinn_dyn.whole import write_whole
 
 _ROWS = 50  # of a table in the terminal
 _HEADS = {  # of options, in Python

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data.logs import LogSource, Measurement
 from pinn_dyn.log_check.equation import Regressor
-from pinn_dyn.whole import write_whole
 
 
 def store(source: LogSource, rigid: Regressor | None, measurements: Sequence[Measurement]) -> None:

@@ -2,14 +2,16 @@
 
 from pinn_dyn.models.black_box import AccelerationMLP, NextStateMLP
 from pinn_dyn.models.cholesky import (
+    Bounded,
     CholeskyFactor,
     ConstantCholesky,
     FixedCholesky,
     NetworkCholesky,
+    Positive,
+    Positivity,
 )
 from pinn_dyn.models.drive_limits import DriveLimits
 from pinn_dyn.models.drives import Drives, TorqueDrives
-from pinn_dyn.models.elastic import ElasticJoints
 from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
     CoulombFriction,
@@ -36,11 +38,11 @@ from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.modes import Modes
 from pinn_dyn.models.oscillators import CoupledOscillators
-from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
 from pinn_dyn.models.residual import NetworkResidual
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.servo import Servo
+from pinn_dyn.models.springs import ElasticJoints
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.subspace_encoder import SubspaceEncoder
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator, State
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
+from pinn_dyn.models.cholesky import lower_solve, upper_solve
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
 class HamiltonianNetwork(structured.StructuredNetwork):

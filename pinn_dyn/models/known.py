@@ -18,13 +18,12 @@ from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.drive_limits import DriveLimits
 from pinn_dyn.models.drives import Drives, TorqueDrives
-from pinn_dyn.models.elastic import ElasticJoints, Springs
 from pinn_dyn.models.friction import NoFriction
-from pinn_dyn.models.joint_springs import JointSprings
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.scales import Joint, Scales
+from pinn_dyn.models.springs import ElasticJoints, JointSprings, Springs
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structure import Structure
 from pinn_dyn.models.structured import FrictionHead

@@ -11,12 +11,12 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
+from pinn_dyn.models.cholesky import lower_solve, upper_solve
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
 class LagrangianNetwork(structured.StructuredNetwork):

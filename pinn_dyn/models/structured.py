@@ -9,10 +9,9 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, MechanicalSystem, State
 from pinn_dyn.mechanics.integrators import with_friction
-from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky
+from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky, Positive
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput, NoInput
-from pinn_dyn.models.positivity import Positive
 from pinn_dyn.models.potential import NetworkPotential, Potential
 from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.scales import Scales

@@ -9,7 +9,7 @@ from typing import Any
 from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.data import DataSource, LogSource, Splits, data_changes, data_identity
-from pinn_dyn.data.fastest_motion import too_long_for
+from pinn_dyn.data.bandwidth import too_long_for
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
 from pinn_dyn.evaluation.prediction import common_stride, default_windows

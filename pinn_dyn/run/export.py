@@ -11,15 +11,15 @@ import pandas as pd
 import torch
 
 from pinn_dyn import __version__
-from pinn_dyn.control.external_torque import NAME, external_torque_function
-from pinn_dyn.exports.exported import ENDINGS, Ranges, Real, write
+from pinn_dyn.atomic_files import write_whole
+from pinn_dyn.control.export import NAME, external_torque_function
+from pinn_dyn.exports.exported_function import ENDINGS, Ranges, Real, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
 from pinn_dyn.models.subspace_encoder import EncodedPredictor
 from pinn_dyn.systems import HasDomain, RigidChain
 from pinn_dyn.systems.robot_files import RobotConstants, new_mjcf, updated_urdf
-from pinn_dyn.whole import write_whole
 
 log = logging.getLogger(__name__)
 

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from pinn_dyn import evaluation
+from pinn_dyn.atomic_files import save_whole, write_whole
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.evaluation.metrics import validation_error
 from pinn_dyn.evaluation.tables import units
@@ -39,7 +40,6 @@ from pinn_dyn.run.prepared import PreparedTraining
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
-from pinn_dyn.whole import save_whole, write_whole
 from pinn_dyn.wording import did_you_mean
 
 log = logging.getLogger(__name__)

@@ -12,14 +12,15 @@ from typing import Any
 
 import torch
 
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
-from pinn_dyn.data.fastest_motion import too_long_for
+from pinn_dyn.data.bandwidth import too_long_for
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.evaluation.baselines import ConstantVelocity
 from pinn_dyn.evaluation.metrics import BEST_BY, score
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
-from pinn_dyn.models.output_limits import set_output_limits
+from pinn_dyn.models.cholesky import set_output_limits
 from pinn_dyn.run.build import ConfigError, ModelBuilder, naming
 from pinn_dyn.run.known_data import check_known, warn_of_log
 from pinn_dyn.run.provenance import provenance
@@ -33,7 +34,6 @@ from pinn_dyn.run.run_folder import (
     in_one_line,
     require_same_data,
 )
-from pinn_dyn.whole import write_whole
 
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""

@@ -15,11 +15,11 @@ import torch
 import yaml
 
 from pinn_dyn import __version__
+from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data import DataSource, data_identity
 from pinn_dyn.data.cache import cache_key
-from pinn_dyn.run.program import command_line
+from pinn_dyn.run.command_line import command_line
 from pinn_dyn.run.run import Run
-from pinn_dyn.whole import write_whole
 
 if TYPE_CHECKING:
     from pinn_dyn.evaluation.report.page import Origin

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from pydantic import PositiveInt
 from torch import Tensor
 
+from pinn_dyn.atomic_files import whole
 from pinn_dyn.data import DataSource, LogSource, RobotSource, data_changes, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
 from pinn_dyn.evaluation.calibration import half_widths
@@ -24,7 +25,7 @@ from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import score
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.compiled import Compiled
-from pinn_dyn.exports.exported import Real
+from pinn_dyn.exports.exported_function import Real
 from pinn_dyn.exports.watch import Watch
 from pinn_dyn.identification.adaptation import Adaptation, Constant, adapted_constants
 from pinn_dyn.identification.payload import identify_payload
@@ -40,7 +41,6 @@ from pinn_dyn.run.build import build_source
 from pinn_dyn.run.export import export, export_samples
 from pinn_dyn.run.external_torque import external_torque, log_motions
 from pinn_dyn.run.predict_frame import predict_frame
-from pinn_dyn.whole import whole
 
 TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""

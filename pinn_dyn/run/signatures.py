@@ -12,7 +12,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from typing import Any
 
-from pinn_dyn.lazy import imported_names
+from pinn_dyn.lazy_imports import imported_names
 
 STAND_INS: dict[Any, type] = {}
 """Names of classes of other packages, and dataclasses with the arguments to accept for them."""

@@ -31,13 +31,12 @@ from pinn_dyn.models import (
     NextStateMLP,
     SubspaceEncoder,
 )
-from pinn_dyn.run.build import ModelBuilder, built
+from pinn_dyn.run.build import ModelBuilder, built, described
+from pinn_dyn.run.command_line import hush
 from pinn_dyn.run.defaults import defaults, even_validations, section
-from pinn_dyn.run.described import described
 from pinn_dyn.run.fit_constants import check_trainer, fit_constants
 from pinn_dyn.run.known_data import match_model
 from pinn_dyn.run.prepared import prepare, same_data
-from pinn_dyn.run.program import hush
 from pinn_dyn.run.run import TRAJECTORIES, Run
 from pinn_dyn.run.run_folder import (
     CHECKPOINTS,

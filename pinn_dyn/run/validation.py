@@ -18,7 +18,7 @@ import pydantic
 from pydantic import Field, NonNegativeFloat, PositiveFloat, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
-from pinn_dyn.lazy import LazyNames
+from pinn_dyn.lazy_imports import LazyNames
 from pinn_dyn.run.signatures import STAND_INS, unknown_keys
 
 _CONFIG = pydantic.ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)

@@ -2,18 +2,21 @@
 
 from typing import TYPE_CHECKING
 
-from pinn_dyn.lazy import lazy_attributes
+from pinn_dyn.lazy_imports import lazy_attributes
 from pinn_dyn.training.constants_fit import COVARIANCE, FIT, Fit
-from pinn_dyn.training.errors import NonFiniteLossError
 from pinn_dyn.training.least_squares import LeastSquares
-from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, Penalized, WindowLoss
+from pinn_dyn.training.losses import (
+    IncrementLoss,
+    MidpointLoss,
+    NonFiniteLossError,
+    Penalized,
+    WindowLoss,
+)
+from pinn_dyn.training.optimizers import SOAP, one_cycle
 from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
-from pinn_dyn.training.schedule import one_cycle
-from pinn_dyn.training.soap import SOAP
 
 if TYPE_CHECKING:
-    from pinn_dyn.training.checkpoints import WholeCheckpoints
-    from pinn_dyn.training.learner import DynamicsLearner
+    from pinn_dyn.training.learner import DynamicsLearner, WholeCheckpoints
 
 __all__ = [
     "COVARIANCE",

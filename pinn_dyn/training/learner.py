@@ -1,4 +1,4 @@
-"""The LightningModule that trains any predictor on windows."""
+"""The LightningModule and the writer of its checkpoints."""
 
 from __future__ import annotations
 
@@ -9,25 +9,39 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any, Literal
 
 import lightning as L
 import torch
+from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import WeightAveraging
 from pydantic import PositiveFloat
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from pinn_dyn.atomic_files import save_whole
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
-from pinn_dyn.models.output_limits import free_weights, output_limits, set_output_limits
+from pinn_dyn.models.cholesky import free_weights, output_limits, set_output_limits
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.adamw import CompiledAdamW, clipped
-from pinn_dyn.training.errors import NonFiniteLossError
 from pinn_dyn.training.gradients import Compiled, Eager, Engine
-from pinn_dyn.training.losses import Penalized, WindowLoss
-from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
+from pinn_dyn.training.losses import NonFiniteLossError, Penalized, WindowLoss
+from pinn_dyn.training.parameter_vector import ELEMENTWISE, CompiledAdamW, ParameterVector, clipped
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoint writer that writes a file next to the checkpoint and renames it."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        """Write a checkpoint, and replace an existing one."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_whole(path, checkpoint)
+
 
 # Lightning warns that batch counts are wrong with dataloader_iter; training_step corrects them.
 warnings.filterwarnings("ignore", ".*`dataloader_iter` (argument|step flavor)")

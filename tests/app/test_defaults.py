@@ -16,8 +16,7 @@ from pinn_dyn.models import (
     NextStateMLP,
     NoFriction,
 )
-from pinn_dyn.run.build import built
-from pinn_dyn.run.described import described
+from pinn_dyn.run.build import built, described
 from pinn_dyn.run.run_folder import with_structures
 from pinn_dyn.systems import RigidChain, SoftArm, TendonArm
 from pinn_dyn.training import SOAP, LeastSquares

@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from pinn_dyn.models.output_limits import free_weights
+from pinn_dyn.models.cholesky import free_weights
 from pinn_dyn.run.run_folder import load_run
 from tests.app.entry import NO_FIGURES, TINY, assert_trained, refused_text, run_script, train
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes ar
 SCRIPT = """
 import multiprocessing, os, sys, time
 from concurrent.futures import ProcessPoolExecutor
-from pinn_dyn.workers import end_with_parent
+from pinn_dyn.worker_processes import end_with_parent
 
 def begin(parent, late):
     if late:

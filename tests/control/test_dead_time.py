@@ -14,7 +14,7 @@ from pinn_dyn.control import (
     close_loop,
 )
 from pinn_dyn.control.contracts import Plant
-from pinn_dyn.control.dead_time import DeadTime
+from pinn_dyn.control.pipeline import DeadTime
 from tests.support.closed_loops import PD
 from tests.support.linear import Pendulums
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from pinn_dyn.data.fastest_motion import periods, too_long_for
+from pinn_dyn.data.bandwidth import periods, too_long_for
 from pinn_dyn.mechanics import Signal, Trajectory
 
 LABELS = ["bend", "length"]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data import DataSource, Splits, StoredSource, data_changes, data_identity, store
-from pinn_dyn.data.fingerprint import describe
+from pinn_dyn.data.cache import describe
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
 

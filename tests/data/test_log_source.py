@@ -19,7 +19,7 @@ from pinn_dyn.data.logs import (
     SplitGaps,
 )
 from pinn_dyn.data.logs.splits import default_split
-from pinn_dyn.data.stored import StoredSource, store
+from pinn_dyn.data.source import StoredSource, store
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
 

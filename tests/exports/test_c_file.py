@@ -13,7 +13,7 @@ import torch
 
 from pinn_dyn.exports import exported
 from pinn_dyn.exports.c_code import ELEMENTWISE, ConstantArrays
-from pinn_dyn.exports.exported import ExportedFunction, write
+from pinn_dyn.exports.exported_function import ExportedFunction, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.run.export import export
 from tests.exports.test_formats import CONSTANT, MODELS

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pinn_dyn.exports.escaping import c_text, xml_comment
-from pinn_dyn.exports.exported import write
+from pinn_dyn.exports.exported_function import write
 from tests.exports.test_c_file import SINE
 from tests.support.c_code import STRICT
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pinn_dyn.exports.casadi_function import casadi_function
-from pinn_dyn.exports.exported import write
+from pinn_dyn.exports.exported_function import write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.run.export import _within_domain
 from pinn_dyn.systems import RigidChain, SoftArm

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pinn_dyn.control import Actuator, Pipeline, Tracking, export_law
-from pinn_dyn.exports.exported import ExportedFunction, write
+from pinn_dyn.exports.exported_function import ExportedFunction, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.run.export import export
 from tests.exports.test_c_file import Bessel

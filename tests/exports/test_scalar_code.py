@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.exports.exported import ExportedFunction, write
+from pinn_dyn.exports.exported_function import ExportedFunction, write
 from pinn_dyn.exports.scalar_code import ScalarTerms
 from pinn_dyn.testing import LinearSystem
 from tests.support.c_code import compiled

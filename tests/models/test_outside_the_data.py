@@ -17,7 +17,7 @@ from pinn_dyn.models import (
     Positive,
     Statistics,
 )
-from pinn_dyn.models.output_limits import output_limits, set_output_limits
+from pinn_dyn.models.cholesky import output_limits, set_output_limits
 from tests.models.builders import CHAIN, make_statistics, make_structured
 from tests.support.contracts import slow_except
 

@@ -9,8 +9,8 @@ from torch.optim import Adam, AdamW
 
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM, compile_graph
 from pinn_dyn.training import MidpointLoss, ParameterVector, one_cycle
-from pinn_dyn.training.adamw import CompiledAdamW, clipped
 from pinn_dyn.training.gradients import Compiled, Eager
+from pinn_dyn.training.parameter_vector import CompiledAdamW, clipped
 from tests.models.builders import make_model
 from tests.support.windows import make_windows, one_step
 

@@ -19,7 +19,7 @@ from pinn_dyn.models import (
 )
 from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager
-from pinn_dyn.training.gradients.program import LossProgram
+from pinn_dyn.training.loss_program import LossProgram
 from tests.models.builders import make_model, make_structured, perturb
 from tests.support.windows import make_windows, one_step, spread_out
 
@@ -88,7 +88,7 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     evaluations = compiled.evaluations(batches[0])
     assert evaluations == (1 if kind_of_loss is MidpointLoss else len(model.integrator.nodes))
     parts = 2 * evaluations  # of 8 windows
-    monkeypatch.setattr("pinn_dyn.training.gradients.compiled.CHUNK", parts)
+    monkeypatch.setattr("pinn_dyn.training.gradients.CHUNK", parts)
     for batch, threads in zip([*batches, batches[-1]], [1, 1, 1, 3], strict=True):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         assert_same(compiled(batch), eager(batch))
@@ -153,7 +153,7 @@ def test_the_program_is_for_long_trainings_on_short_windows(monkeypatch, case):
 
 def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
     monkeypatch.setattr(torch, "compile", lambda function: function)
-    monkeypatch.setattr("pinn_dyn.training.gradients.compiled.CHUNK", 7)
+    monkeypatch.setattr("pinn_dyn.training.gradients.CHUNK", 7)
     model = make_model("lnn")
     loss = IncrementLoss(one_step(size=2), model).double()
     batch = make_windows(25, size=2)

@@ -22,8 +22,8 @@ from pinn_dyn.training import (
     MidpointLoss,
     NonFiniteLossError,
 )
-from pinn_dyn.training.adamw import clipped
 from pinn_dyn.training.gradients import Compiled
+from pinn_dyn.training.parameter_vector import clipped
 from tests.support.training import MODELS, Oscillators, make_splits, make_trainer
 
 

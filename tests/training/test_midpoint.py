@@ -11,7 +11,7 @@ from numpy.polynomial import Polynomial
 from pinn_dyn.data import draw_windows
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
 from pinn_dyn.training import MidpointLoss
-from pinn_dyn.training.losses.midpoint import midpoint
+from pinn_dyn.training.losses import midpoint
 from tests.models.builders import make_model
 from tests.support.windows import make_windows, one_step
 

@@ -1,4 +1,4 @@
-"""Gradients by compiled programs."""
+"""Gradient engines: eager autograd, or programs that are compiled."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.data.windows import Windows
-from pinn_dyn.mechanics import ContinuousPredictor
+from pinn_dyn.mechanics import ContinuousPredictor, Predictor
 from pinn_dyn.mechanics.compilation import (
     CHUNK,
     MOST_EVALUATIONS,
@@ -16,11 +16,23 @@ from pinn_dyn.mechanics.compilation import (
     CompiledDynamics,
     integrated_by,
 )
-from pinn_dyn.training.adamw import CompiledAdamW
-from pinn_dyn.training.gradients.program import LossProgram, weighted_sum
-from pinn_dyn.training.gradients.state_windows import StateWindows
+from pinn_dyn.training.loss_program import LossProgram, StateWindows, weighted_sum
 from pinn_dyn.training.losses import WindowLoss
-from pinn_dyn.training.parameter_vector import ParameterVector
+from pinn_dyn.training.parameter_vector import CompiledAdamW, ParameterVector
+
+Engine = Callable[[Windows], tuple[Tensor, Tensor]]
+"""Function from windows to the loss ``()`` and its gradient ``(P,)``."""
+
+
+class Eager:
+    """Engine for loss and gradient by eager autograd."""
+
+    def __init__(self, loss: WindowLoss, model: Predictor, vector: ParameterVector):
+        self.loss, self.model, self.vector = loss, model, vector
+
+    def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        loss = self.loss(self.model, windows)
+        return loss.detach(), self.vector.gradient_of(loss)
 
 
 class Compiled:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -13,12 +13,32 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from pinn_dyn.data.windows import Windows
-from pinn_dyn.mechanics import ContinuousPredictor
+from pinn_dyn.mechanics import ContinuousPredictor, State
 from pinn_dyn.mechanics.compilation import Unrolled, compile_graph, integrated_by
-from pinn_dyn.training.adamw import MOVED, CompiledAdamW
-from pinn_dyn.training.gradients.state_windows import StateWindows
 from pinn_dyn.training.losses import WindowLoss
-from pinn_dyn.training.parameter_vector import ParameterVector
+from pinn_dyn.training.parameter_vector import MOVED, CompiledAdamW, ParameterVector
+
+
+@dataclass(frozen=True)
+class StateWindows(Windows):
+    """Windows with precomputed states of a model."""
+
+    x0: Tensor  # state at the start, (B, 2N), with the batch contiguous in memory
+    dx: Tensor  # increments up to each step, (B, H, 2N)
+
+    @classmethod
+    def of(cls, windows: Windows, state: State) -> StateWindows:
+        """Build from windows, for a model of this state."""
+        values = {item.name: getattr(windows, item.name) for item in fields(Windows)}
+        x0 = windows.start(state).mT.contiguous().mT
+        return cls(**values, x0=x0, dx=windows.increments(state))
+
+    def start(self, state: State, past: int = 0) -> Tensor:
+        return self.x0
+
+    def increments(self, state: State) -> Tensor:
+        return self.dx
+
 
 Program = Callable[..., list[Tensor]]
 _ROWS = {"qv": ("q", "v", "dq", "dv"), "qp": ("q", "p", "dq", "dp")}

@@ -1,5 +1,0 @@
-"""Errors of a training."""
-
-
-class NonFiniteLossError(RuntimeError):
-    """Error: the training loss became NaN or infinite."""
