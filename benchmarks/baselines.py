@@ -19,7 +19,7 @@ from pinn_dyn.evaluation import (
     rollout_metrics,
 )
 from pinn_dyn.mechanics import Predictor, stack_until
-from pinn_dyn.run.build import build_source
+from pinn_dyn.run.configuration.build import build_source
 
 LINEAR_STEP = 0.01  # smallest step of the linear baselines, s; smaller steps give larger errors
 # Horizon, step of the rollouts and windows of each data set, s.

@@ -11,8 +11,13 @@ from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
-from pinn_dyn.run import prepared, trainer
-from pinn_dyn.run.build import build_part, build_predictor, build_source, model_builder
+from pinn_dyn.run.configuration.build import (
+    build_part,
+    build_predictor,
+    build_source,
+    model_builder,
+)
+from pinn_dyn.run.training import prepared, trainer
 from pinn_dyn.training import DynamicsLearner
 
 

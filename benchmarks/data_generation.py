@@ -26,7 +26,7 @@ from pinn_dyn.app.config import CONF, resolved
 from pinn_dyn.data import SimulatedSource
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.run.build import build_source
+from pinn_dyn.run.configuration.build import build_source
 from pinn_dyn.run.provenance import provenance
 
 RESULTS = Path(__file__).parent / "results"

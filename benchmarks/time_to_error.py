@@ -35,7 +35,7 @@ from pinn_dyn.data import DynamicsData, LightningData
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Predictor, Trajectory, stack
 from pinn_dyn.run.provenance import provenance
-from pinn_dyn.run.trainer import epochs
+from pinn_dyn.run.training.trainer import epochs
 
 PAPER_ERROR = {"hnn": 0.022, "lnn": 0.171}
 HORIZON = 5.0  # s

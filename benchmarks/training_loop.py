@@ -43,8 +43,9 @@ from pinn_dyn.app.config import composed
 from pinn_dyn.data import DataSource, LightningData, Splits
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
-from pinn_dyn.run import build, trainer
+from pinn_dyn.run.configuration import build
 from pinn_dyn.run.provenance import provenance
+from pinn_dyn.run.training import trainer
 
 RESULTS = Path(__file__).parent / "results"
 STEP = 2e-3

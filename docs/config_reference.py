@@ -19,8 +19,8 @@ import griffe
 import yaml
 
 from pinn_dyn.app.settings import SETTINGS
-from pinn_dyn.run.defaults import defaults
-from pinn_dyn.run.validation import arguments_model
+from pinn_dyn.run.configuration.defaults import defaults
+from pinn_dyn.run.configuration.validation import arguments_model
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from pinn_dyn.mechanics import Terms as Terms
     from pinn_dyn.mechanics import Trajectory as Trajectory
     from pinn_dyn.run.evaluation import evaluate as evaluate
-    from pinn_dyn.run.fit import fit as fit
     from pinn_dyn.run.run import Run as Run
     from pinn_dyn.run.run import ensemble as ensemble
     from pinn_dyn.run.run_folder import load as load
-    from pinn_dyn.run.training import train as train
+    from pinn_dyn.run.training.fit import fit as fit
+    from pinn_dyn.run.training.train import train as train
     from pinn_dyn.systems import SoftArm as SoftArm
 
 __version__ = "0.4.0"

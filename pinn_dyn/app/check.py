@@ -16,10 +16,10 @@ from pinn_dyn.log_check.check import LogCheck
 from pinn_dyn.log_check.check import check as check_log
 from pinn_dyn.log_check.structure import SCALE
 from pinn_dyn.models.structure import Structure
-from pinn_dyn.run.build import ConfigError, build_part, build_source, naming
-from pinn_dyn.run.command_line import command_line
-from pinn_dyn.run.known_data import joints_of, match_structure
+from pinn_dyn.run.configuration.build import ConfigError, build_part, build_source, naming
+from pinn_dyn.run.configuration.command_line import command_line
 from pinn_dyn.run.run_folder import write_config
+from pinn_dyn.run.training.known_data import joints_of, match_structure
 from pinn_dyn.systems import RigidChain
 
 

@@ -22,8 +22,8 @@ from omegaconf.errors import OmegaConfBaseException
 from pinn_dyn import wording
 from pinn_dyn.app.config import completed, composed, config_folder, explained
 from pinn_dyn.app.sweep import write_error
-from pinn_dyn.run.command_line import hush
-from pinn_dyn.run.validation import ConfigError
+from pinn_dyn.run.configuration.command_line import hush
+from pinn_dyn.run.configuration.validation import ConfigError
 
 
 def main(command: str) -> None:

@@ -16,8 +16,13 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.settings import SETTINGS
-from pinn_dyn.run.defaults import defaults, even_validations
-from pinn_dyn.run.validation import ConfigError, check_arguments, check_keys, check_value
+from pinn_dyn.run.configuration.defaults import defaults, even_validations
+from pinn_dyn.run.configuration.validation import (
+    ConfigError,
+    check_arguments,
+    check_keys,
+    check_value,
+)
 from pinn_dyn.wording import did_you_mean
 
 if TYPE_CHECKING:
@@ -160,7 +165,9 @@ def dataset(name: str, **settings: Any) -> DataSource:
 
     ``settings`` replace arguments of the file ``<name>.yaml``.
     """
-    from pinn_dyn.run.build import build_source  # imports PyTorch, which --help does not need
+    from pinn_dyn.run.configuration.build import (
+        build_source,  # imports PyTorch, which --help does not need
+    )
 
     overrides = [f"dataset={name}", *(f"dataset.{key}={x}" for key, x in settings.items())]
     return build_source(composed("train", overrides))

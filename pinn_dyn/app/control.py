@@ -22,12 +22,12 @@ from pinn_dyn.evaluation import close_loops
 from pinn_dyn.evaluation.learned_terms import term_conditions
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
 from pinn_dyn.models import CoupledOscillators
-from pinn_dyn.run.build import ConfigError, build_part
+from pinn_dyn.run.configuration.build import ConfigError, build_part
+from pinn_dyn.run.configuration.trust import packages
 from pinn_dyn.run.export import ranges_of
 from pinn_dyn.run.provenance import write_provenance
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import load_run, write_config
-from pinn_dyn.run.trust import packages
 
 log = logging.getLogger(__name__)
 

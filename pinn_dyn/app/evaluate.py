@@ -11,12 +11,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
-from pinn_dyn.run.build import ConfigError, build_source
+from pinn_dyn.run.configuration.build import ConfigError, build_source
+from pinn_dyn.run.configuration.trust import packages
 from pinn_dyn.run.evaluation import evaluate
 from pinn_dyn.run.provenance import write_provenance
 from pinn_dyn.run.run import Run, ensemble
 from pinn_dyn.run.run_folder import CONFIG, flattened, load_run
-from pinn_dyn.run.trust import packages
 
 _SEEDS = ("seed", "data.seed")
 

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.config import checked
 from pinn_dyn.identification.excitation_design import design_excitation
-from pinn_dyn.run.build import ConfigError, build_part
+from pinn_dyn.run.configuration.build import ConfigError, build_part
 from pinn_dyn.run.run_folder import write_config
 
 

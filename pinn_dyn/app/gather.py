@@ -19,8 +19,8 @@ from pinn_dyn.app.sweep import ERROR, first_line
 from pinn_dyn.atomic_files import read_regular
 from pinn_dyn.evaluation import save, sweep_figure
 from pinn_dyn.evaluation.tables import competing, over_seeds, to_text, varied_settings, write_table
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run_folder import CONFIG, METRICS
-from pinn_dyn.run.validation import ConfigError
 
 _RECORDED = ("training_seconds", "steps", "kept_step", "pairs", "parameters")
 _SPLITS = ("val", "last", "test")  # the kept model on validation data, the last one, on test data

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pinn_dyn.run.signatures import STAND_INS
-from pinn_dyn.run.validation import Seed
+from pinn_dyn.run.configuration.signatures import STAND_INS
+from pinn_dyn.run.configuration.validation import Seed
 
 if TYPE_CHECKING:
     from lightning import Callback, Trainer

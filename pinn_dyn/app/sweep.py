@@ -19,7 +19,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pinn_dyn.run.command_line import program
+from pinn_dyn.run.configuration.command_line import program
 from pinn_dyn.worker_processes import end_with_parent
 
 log = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ from pinn_dyn.app.config import checked
 from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.evaluation.metrics import validation_error
-from pinn_dyn.run import training
-from pinn_dyn.run.build import ConfigError, build_part, build_source, model_builder
+from pinn_dyn.run.configuration.build import ConfigError, build_part, build_source, model_builder
+from pinn_dyn.run.configuration.trust import check_name, packages, require_trusted
 from pinn_dyn.run.run_folder import (
     CHECKPOINTS,
     load_run,
@@ -24,8 +24,8 @@ from pinn_dyn.run.run_folder import (
     read_checkpoint,
     require_no_links_out,
 )
-from pinn_dyn.run.trainer import tensorboard
-from pinn_dyn.run.trust import check_name, packages, require_trusted
+from pinn_dyn.run.training import train as training
+from pinn_dyn.run.training.trainer import tensorboard
 
 log = logging.getLogger(__name__)
 

@@ -17,9 +17,9 @@ from pinn_dyn.evaluation.tables import model_names
 from pinn_dyn.identification.constants import read_constants
 from pinn_dyn.mechanics import double_copy, stack_until
 from pinn_dyn.progress import Progress
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import flattened, require_same_data
-from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.training.least_squares import IDENTIFICATION
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from pinn_dyn import __version__
 from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data import DataSource, data_identity
 from pinn_dyn.data.cache import cache_key
-from pinn_dyn.run.command_line import command_line
+from pinn_dyn.run.configuration.command_line import command_line
 from pinn_dyn.run.run import Run
 
 if TYPE_CHECKING:

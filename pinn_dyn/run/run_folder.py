@@ -23,9 +23,9 @@ from pinn_dyn.evaluation.tables import short
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.cholesky import set_output_limits
-from pinn_dyn.run.build import ConfigError, ModelBuilder, model_builder
+from pinn_dyn.run.configuration.build import ConfigError, ModelBuilder, model_builder
+from pinn_dyn.run.configuration.trust import is_trusted, packages, require_trusted
 from pinn_dyn.run.run import Run
-from pinn_dyn.run.trust import is_trusted, packages, require_trusted
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
 from pinn_dyn.training import COVARIANCE, FIT

@@ -136,7 +136,7 @@ FAST = (
 @pytest.mark.parametrize("name", slow_except(COMMANDS, FAST))
 def test_the_suggested_override_works(name, tmp_path, monkeypatch, runs):
     if name == "no compiler":
-        monkeypatch.setattr("pinn_dyn.run.trainer.has_cpp_compiler", lambda: False)
+        monkeypatch.setattr("pinn_dyn.run.training.trainer.has_cpp_compiler", lambda: False)
     arm = log("arm", 0, 0.05)
     table = {"t": arm.t, "q1": arm.q[:, 0], "q2": arm.q[:, 1], "u1": arm.u[:, 0], "u2": arm.u[:, 1]}
     pd.DataFrame(table).to_csv(tmp_path / "arm.csv", index=False)

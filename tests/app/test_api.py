@@ -455,7 +455,9 @@ def test_a_log_is_fitted_in_every_form(monkeypatch, tmp_path, kind):
     forms = {"dict": runs, "list": list(runs.values()), "path": tmp_path / "my arm.csv"}
     forms["columns"] = {name: frame[name].to_numpy() for name in frame}
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pinn_dyn.run.fit.train", lambda source, *_, **__: sources.append(source))
+    monkeypatch.setattr(
+        "pinn_dyn.run.training.fit.train", lambda source, *_, **__: sources.append(source)
+    )
     column = "run" if kind in ("columns", "path") else None
     path = "my arm.csv" if kind == "path" else forms[kind]
     for form, run in ((frame, "run"), (path, column)):

@@ -3,9 +3,9 @@
 import pytest
 
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
-from pinn_dyn.run import trainer
-from pinn_dyn.run.build import build_part
-from pinn_dyn.run.validation import ConfigError
+from pinn_dyn.run.configuration.build import build_part
+from pinn_dyn.run.configuration.validation import ConfigError
+from pinn_dyn.run.training import trainer
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from pinn_dyn.data import data_identity
-from pinn_dyn.run.build import build_source
+from pinn_dyn.run.configuration.build import build_source
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run_folder import load_run, require_same_data
-from pinn_dyn.run.validation import ConfigError
 from tests.app.entry import NO_FIGURES, ROOT, TINY_TRAINING, refused_text, run_script
 from tests.support.foreign_runs import foreign
 

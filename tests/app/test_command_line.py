@@ -110,8 +110,10 @@ def test_a_missing_value_is_asked_for_by_name(elsewhere, capsys, words, key):
 def test_a_missing_compiler_or_device_is_refused_before_data_are_made(
     elsewhere, capsys, monkeypatch, word, message
 ):
-    monkeypatch.setattr("pinn_dyn.run.trainer.has_cpp_compiler", lambda: False)
-    monkeypatch.setattr("pinn_dyn.run.prepared.build_data", lambda *_: pytest.fail("made data"))
+    monkeypatch.setattr("pinn_dyn.run.training.trainer.has_cpp_compiler", lambda: False)
+    monkeypatch.setattr(
+        "pinn_dyn.run.training.prepared.build_data", lambda *_: pytest.fail("made data")
+    )
     assert message in refused_text(capsys, "train.py", *TINY, NO_FIGURES, word)
 
 

@@ -16,7 +16,7 @@ from pinn_dyn.models import (
     NextStateMLP,
     NoFriction,
 )
-from pinn_dyn.run.build import built, described
+from pinn_dyn.run.configuration.build import built, described
 from pinn_dyn.run.run_folder import with_structures
 from pinn_dyn.systems import RigidChain, SoftArm, TendonArm
 from pinn_dyn.training import SOAP, LeastSquares
@@ -66,7 +66,7 @@ def of_python(monkeypatch, source, model, **arguments):
         configs.append(config)
         raise InterruptedError
 
-    monkeypatch.setattr("pinn_dyn.run.training.claimed", stop)
+    monkeypatch.setattr("pinn_dyn.run.training.train.claimed", stop)
     with pytest.raises(InterruptedError):
         pinn_dyn.train(source, model, **arguments)
     (config,) = configs
@@ -89,7 +89,9 @@ def test_the_command_line_and_python_train_alike(monkeypatch, model, dataset):
     config["trainer"].pop("_target_")
     if model == "known_system":  # with numbers for each segment, as Python describes it
         config["model"]["structure"] = described(built(config["model"]["structure"]))
-    monkeypatch.setattr("pinn_dyn.run.training.match_model", lambda model, source: (model, {}))
+    monkeypatch.setattr(
+        "pinn_dyn.run.training.train.match_model", lambda model, source: (model, {})
+    )
     builder = BUILDERS.get(model, model)
     recorded = of_python(monkeypatch, pinn_dyn.dataset(dataset), builder, **arguments)
     assert_equal_parts(with_structures(config), recorded)

@@ -10,8 +10,8 @@ import yaml
 
 from pinn_dyn.data import LogSource
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
-from pinn_dyn.run.known_data import check_known, match_model, match_structure
-from pinn_dyn.run.validation import ConfigError
+from pinn_dyn.run.configuration.validation import ConfigError
+from pinn_dyn.run.training.known_data import check_known, match_model, match_structure
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.wording import command_line
 from tests.support.rigid_chains import joint, link, robot

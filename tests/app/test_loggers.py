@@ -8,7 +8,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
-from pinn_dyn.run.trainer import _MovableCheckpoint
+from pinn_dyn.run.training.trainer import _MovableCheckpoint
 from tests.app.entry import train
 
 FIGURES = {"rollout/trajectory", "rollout/error", "terms/bent", "terms/strongly_bent"}

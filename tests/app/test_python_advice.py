@@ -10,8 +10,8 @@ import pytest
 
 import pinn_dyn
 from pinn_dyn.data.logs import LogError, LogSource
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run_folder import load_run, require_no_links_out
-from pinn_dyn.run.validation import ConfigError
 from pinn_dyn.systems import BulletArm, RigidChain
 from tests.app.entry import NO_FIGURES, ROOT, TINY_DATA, fails, run_script, train
 from tests.support.foreign_runs import foreign

@@ -117,7 +117,9 @@ def test_a_resumed_training_equals_an_uninterrupted_one(run, tmp_path):
 
 def test_a_finished_training_is_not_repeated(run, monkeypatch):
     finished = trained(run)
-    monkeypatch.setattr("pinn_dyn.run.training.prepare", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(
+        "pinn_dyn.run.training.train.prepare", lambda *_: pytest.fail("trained again")
+    )
     assert trained(run).metrics == finished.metrics
     (run / "metrics.json").unlink()  # a copy
     assert trained(run).metrics == finished.metrics

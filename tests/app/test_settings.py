@@ -10,8 +10,8 @@ from pinn_dyn.app.config import checked, composed, config_folder
 from pinn_dyn.data.logs import Columns
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.models import CholeskyFactor
-from pinn_dyn.run.trainer import epochs
-from pinn_dyn.run.validation import ConfigError, check_arguments, check_value
+from pinn_dyn.run.configuration.validation import ConfigError, check_arguments, check_value
+from pinn_dyn.run.training.trainer import epochs
 from tests.app.entry import refused_text
 from tests.support.composing import REQUIRED, compose
 

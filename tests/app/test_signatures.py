@@ -7,7 +7,7 @@ import sys
 import types
 
 from pinn_dyn.app.config import CONF
-from pinn_dyn.run.signatures import unknown_keys
+from pinn_dyn.run.configuration.signatures import unknown_keys
 
 TEXT = "".join(file.read_text("utf-8") for file in CONF.rglob("*.yaml"))
 TARGETS = sorted(set(re.findall(r"_target_: *([\w.]+)", TEXT)) - {"lightning.Trainer"})

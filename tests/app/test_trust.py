@@ -6,10 +6,10 @@ import pytest
 
 from pinn_dyn.app.config import CONF
 from pinn_dyn.data.logs import SubtractStart
-from pinn_dyn.run import trust
-from pinn_dyn.run.build import build_part
+from pinn_dyn.run.configuration import trust
+from pinn_dyn.run.configuration.build import build_part
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run_folder import load_run, read_checkpoint
-from pinn_dyn.run.validation import ConfigError
 from tests.app.entry import run_script
 from tests.support.foreign_runs import foreign
 

@@ -61,7 +61,7 @@ def test_a_run_is_read_without_the_imports_of_its_callbacks():
 import sys
 sys.modules.update(hydra=None, lightning=None, matplotlib=None)
 import pinn_dyn.run.run_folder
-from pinn_dyn.run.trust import may_build
+from pinn_dyn.run.configuration.trust import may_build
 assert may_build("pinn_dyn.evaluation.RolloutFigures", ())
 assert not may_build("pinn_dyn.evaluation.save", ()), "no class"
 assert not may_build("pinn_dyn.evaluation.Path", ()), "not public"

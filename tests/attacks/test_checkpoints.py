@@ -6,8 +6,8 @@ import shutil
 import pytest
 import torch
 
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run_folder import load_run
-from pinn_dyn.run.validation import ConfigError
 from tests.app.entry import NO_FIGURES, TINY, refused_text
 
 

@@ -9,8 +9,8 @@ from pinn_dyn import whole
 from pinn_dyn.app.gather import read_runs, read_test_errors
 from pinn_dyn.data import StoredSource
 from pinn_dyn.identification.constants import read_constants
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run_folder import load_run
-from pinn_dyn.run.validation import ConfigError
 
 
 def as_pipe(path):

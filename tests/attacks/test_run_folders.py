@@ -3,8 +3,8 @@
 import pytest
 
 from pinn_dyn.app.config import CONF
+from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.run_folder import load_run
-from pinn_dyn.run.validation import ConfigError
 from tests.support.foreign_runs import foreign
 
 MARK = "was_here"

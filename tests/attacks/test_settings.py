@@ -7,7 +7,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from pinn_dyn.app.config import checked
-from pinn_dyn.run.validation import ConfigError
+from pinn_dyn.run.configuration.validation import ConfigError
 from tests.support.composing import REQUIRED, compose
 
 # What the generated values below do not try: limits, keys of the program, code, values in lists.

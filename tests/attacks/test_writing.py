@@ -5,7 +5,7 @@ import shutil
 import pytest
 import torch
 
-from pinn_dyn.run.validation import ConfigError
+from pinn_dyn.run.configuration.validation import ConfigError
 from tests.app.entry import NO_FIGURES, refused_text, run_script, train
 from tests.support.foreign_runs import foreign
 

@@ -12,8 +12,8 @@ import torch
 from pinn_dyn.app.config import composed
 from pinn_dyn.data import draw_windows, logs
 from pinn_dyn.mechanics import stack
-from pinn_dyn.run.build import build_source
-from pinn_dyn.run.trust import may_build
+from pinn_dyn.run.configuration.build import build_source
+from pinn_dyn.run.configuration.trust import may_build
 from tests.data.logs_files import motion, write
 from tests.support.recorded_logs import LOGS, needs_logs
 
@@ -127,7 +127,7 @@ def test_run_folders_may_name_the_steps_of_the_package_only(tmp_path):
     """A folder ``examples`` beside a foreign run is neither trusted nor executed."""
     (tmp_path / "examples").mkdir()
     (tmp_path / "examples" / "__init__.py").write_text("open('was_here', 'w')")
-    code = "from pinn_dyn.run.trust import may_build as may; print(may({!r}, ()))"
+    code = "from pinn_dyn.run.configuration.trust import may_build as may; print(may({!r}, ()))"
     name = "pinn_dyn.data.logs.{}"
     result = subprocess.run(
         [sys.executable, "-c", code.format(name.format("SubtractStart"))],

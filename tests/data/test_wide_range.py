@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from pinn_dyn.run.build import build_source
+from pinn_dyn.run.configuration.build import build_source
 from reproduce import read_entries
 from tests.support.composing import compose
 

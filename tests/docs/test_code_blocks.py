@@ -12,7 +12,7 @@ import pytest
 from hydra.errors import ConfigCompositionException
 
 from pinn_dyn.app.config import config_folder
-from pinn_dyn.run.validation import ConfigError
+from pinn_dyn.run.configuration.validation import ConfigError
 from tests.docs.blocks import PAGES, PLAYED, ROOT, blocks
 from tests.docs.commands import check_command, compose
 

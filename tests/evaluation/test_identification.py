@@ -18,7 +18,7 @@ from pinn_dyn.identification.constants import (
 from pinn_dyn.identification.rigid_excitation import rigid_excitation
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import AsymmetricCoulomb
-from pinn_dyn.run.fit_constants import write_constants
+from pinn_dyn.run.training.fit_constants import write_constants
 from pinn_dyn.training import Fit
 from pinn_dyn.training.constants_fit import Prior
 from tests.support.known import known_model

@@ -15,7 +15,7 @@ from hydra.utils import instantiate
 
 from pinn_dyn.data.logs import LogError, LogSource
 from pinn_dyn.log_check.check import check
-from pinn_dyn.run.known_data import match_structure
+from pinn_dyn.run.training.known_data import match_structure
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.wording import command_line
 from tests.support.composing import compose

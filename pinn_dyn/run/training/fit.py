@@ -12,9 +12,9 @@ from pydantic import PositiveInt
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.run.build import ModelBuilder
+from pinn_dyn.run.configuration.build import ModelBuilder
 from pinn_dyn.run.run import Run
-from pinn_dyn.run.training import train
+from pinn_dyn.run.training.train import train
 
 Signals = str | Sequence[str] | Mapping[str, Any]
 

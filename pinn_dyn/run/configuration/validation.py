@@ -19,7 +19,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, TypeAdapter, Valida
 from pydantic_core import PydanticCustomError
 
 from pinn_dyn.lazy_imports import LazyNames
-from pinn_dyn.run.signatures import STAND_INS, unknown_keys
+from pinn_dyn.run.configuration.signatures import STAND_INS, unknown_keys
 
 _CONFIG = pydantic.ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
 _LISTS = (

@@ -15,7 +15,7 @@ from pinn_dyn.log_check.check import verdict
 from pinn_dyn.log_check.input_faults import SATURATES
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models import KnownMechanics
-from pinn_dyn.run.build import ConfigError, ModelBuilder
+from pinn_dyn.run.configuration.build import ConfigError, ModelBuilder
 from pinn_dyn.systems import RigidChain
 
 log = logging.getLogger(__name__)

@@ -34,11 +34,11 @@ from pinn_dyn.log_check.check import residual_figure
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.plots import save
-from pinn_dyn.run.build import ConfigError, naming
-from pinn_dyn.run.defaults import defaults, section
-from pinn_dyn.run.prepared import PreparedTraining
+from pinn_dyn.run.configuration.build import ConfigError, naming
+from pinn_dyn.run.configuration.defaults import defaults, section
 from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
+from pinn_dyn.run.training.prepared import PreparedTraining
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
 from pinn_dyn.wording import did_you_mean
 

@@ -31,12 +31,9 @@ from pinn_dyn.models import (
     NextStateMLP,
     SubspaceEncoder,
 )
-from pinn_dyn.run.build import ModelBuilder, built, described
-from pinn_dyn.run.command_line import hush
-from pinn_dyn.run.defaults import defaults, even_validations, section
-from pinn_dyn.run.fit_constants import check_trainer, fit_constants
-from pinn_dyn.run.known_data import match_model
-from pinn_dyn.run.prepared import prepare, same_data
+from pinn_dyn.run.configuration.build import ModelBuilder, built, described
+from pinn_dyn.run.configuration.command_line import hush
+from pinn_dyn.run.configuration.defaults import defaults, even_validations, section
 from pinn_dyn.run.run import TRAJECTORIES, Run
 from pinn_dyn.run.run_folder import (
     CHECKPOINTS,
@@ -46,6 +43,9 @@ from pinn_dyn.run.run_folder import (
     merged,
     with_structures,
 )
+from pinn_dyn.run.training.fit_constants import check_trainer, fit_constants
+from pinn_dyn.run.training.known_data import match_model
+from pinn_dyn.run.training.prepared import prepare, same_data
 from pinn_dyn.training import IncrementLoss, LeastSquares, MidpointLoss, WindowLoss, one_cycle
 from pinn_dyn.wording import did_you_mean
 
@@ -110,8 +110,8 @@ def train(
         optimizer=partial(torch.optim.AdamW, lr=0.002)
 
     Arguments that are None depend on the model and on the kind of data. They are those of train.py,
-    see :func:`~.run.defaults.defaults`, also for ``activation`` of a ``NextStateMLP``, ``state`` of
-    a ``HamiltonianNetwork`` and ``friction`` of ``KnownMechanics``.
+    see :func:`~.run.configuration.defaults.defaults`, also for ``activation`` of a
+    ``NextStateMLP``, ``state`` of a ``HamiltonianNetwork`` and ``friction`` of ``KnownMechanics``.
 
     A folder with an interrupted training of the same data and arguments is resumed, and a finished
     one is loaded. A folder with another training is refused.
@@ -199,7 +199,7 @@ def train(
             elif isinstance(optimizer, LeastSquares):
                 fit_constants(prepare_now, optimizer, saved, start_from, callbacks, loggers)
             else:
-                from pinn_dyn.run.trainer import train_network  # imports Lightning
+                from pinn_dyn.run.training.trainer import train_network  # imports Lightning
 
                 train_network(
                     prepare_now,

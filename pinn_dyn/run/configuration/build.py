@@ -15,7 +15,7 @@ from typing import Any
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.cache import plain
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.run.validation import ConfigError, check_value
+from pinn_dyn.run.configuration.validation import ConfigError, check_value
 
 ModelBuilder = Callable[..., Predictor]
 """Builder of a model, called with ``statistics=``."""

@@ -21,8 +21,7 @@ from pinn_dyn.evaluation.metrics import BEST_BY, score
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.cholesky import set_output_limits
-from pinn_dyn.run.build import ConfigError, ModelBuilder, naming
-from pinn_dyn.run.known_data import check_known, warn_of_log
+from pinn_dyn.run.configuration.build import ConfigError, ModelBuilder, naming
 from pinn_dyn.run.provenance import provenance
 from pinn_dyn.run.run import TRAJECTORIES, Run
 from pinn_dyn.run.run_folder import (
@@ -34,6 +33,7 @@ from pinn_dyn.run.run_folder import (
     in_one_line,
     require_same_data,
 )
+from pinn_dyn.run.training.known_data import check_known, warn_of_log
 
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from pinn_dyn.run.signatures import definition
-from pinn_dyn.run.validation import ConfigError, places
+from pinn_dyn.run.configuration.signatures import definition
+from pinn_dyn.run.configuration.validation import ConfigError, places
 from pinn_dyn.systems.urdf_file import is_mjcf
 
 _PACKAGES = (

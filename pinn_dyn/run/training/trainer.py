@@ -26,9 +26,9 @@ from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
 from pinn_dyn.progress import Progress
-from pinn_dyn.run.build import ConfigError, naming
-from pinn_dyn.run.prepared import PreparedTraining
+from pinn_dyn.run.configuration.build import ConfigError, naming
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
+from pinn_dyn.run.training.prepared import PreparedTraining
 from pinn_dyn.training import DynamicsLearner, WholeCheckpoints, WindowLoss
 
 LONGEST_EPOCH = 1000

@@ -1,0 +1,1 @@
+"""Trainings: preparation, networks by Lightning, constants by least squares, and fits of logs."""
