@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from pinn_dyn import whole
+from pinn_dyn import atomic_files
 from pinn_dyn.app.gather import read_runs, read_test_errors
 from pinn_dyn.data import StoredSource
 from pinn_dyn.identification.constants import read_constants
@@ -21,7 +21,7 @@ def as_pipe(path):
 def as_huge(path):
     """Make a file sparse: it takes no room."""
     path.touch()
-    os.truncate(path, whole._LARGEST + 1)
+    os.truncate(path, atomic_files._LARGEST + 1)
 
 
 def as_device(path):

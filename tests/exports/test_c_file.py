@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.exports import exported
 from pinn_dyn.exports.c_code import ELEMENTWISE, ConstantArrays
-from pinn_dyn.exports.exported_function import ExportedFunction, write
+from pinn_dyn.exports.exported_function import ExportedFunction, identifier, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.run.export import export
 from tests.exports.test_formats import CONSTANT, MODELS
@@ -30,7 +29,7 @@ def assert_repeats(model, path, tolerance, names=("forward_dynamics", "step")):
         arguments = [values[name] for name in function.inputs]
         expected = function.function(*arguments)
         expected = [expected] if isinstance(expected, torch.Tensor) else expected
-        call = function_of(path, f"{exported.identifier(path.stem)}_{function.name}", library)
+        call = function_of(path, f"{identifier(path.stem)}_{function.name}", library)
         for x, y in zip(call(*(x.numpy() for x in arguments)), expected, strict=True):
             scale = np.abs(y.numpy()).max() + 1e-300
             np.testing.assert_allclose(x, y.numpy().ravel(), rtol=0, atol=tolerance * scale)
@@ -251,4 +250,4 @@ def test_numbers_are_written_exactly():
     texts = [constants.number(x) for x in values]
     assert texts[3:6] == ["INFINITY", "(-INFINITY)", "NAN"]
     assert [float(texts[k].strip("()")) for k in (0, 1, 2)] == values[:3]
-    assert exported.identifier("7 arm-é") == "_7_arm__"
+    assert identifier("7 arm-é") == "_7_arm__"
