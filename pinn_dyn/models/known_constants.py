@@ -184,7 +184,6 @@ class PhysicalBodies(Constants):
         self.register_buffer("root", (mass.sqrt() * root).float())
         spreads = torch.as_tensor(spread, dtype=torch.float32).expand(len(start))
         self.register_buffer("spread", spreads[:, None].clone())
-        self.register_load_state_dict_pre_hook(_add_spread)
 
     def start(self) -> Tensor:
         """Return J_start, ``(n, 4, 4)``."""
@@ -220,9 +219,3 @@ class PhysicalBodies(Constants):
         shears = unit[..., [0, 0, 1, 0, 1, 2], [1, 2, 2, 3, 3, 3]]
         values = torch.cat([scale.log()[..., None], sizes, shears], dim=-1)
         return values / self.spread
-
-
-def _add_spread(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Add the spread to a checkpoint of an earlier version, in which all bodies had the same."""
-    spread = module.get_buffer("spread")
-    state.setdefault(f"{prefix}spread", spread.min().expand_as(spread))

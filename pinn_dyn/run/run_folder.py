@@ -34,7 +34,6 @@ CONFIG = "config.yaml"
 METRICS, CHECKPOINTS = "metrics.json", "checkpoints"
 RECORD, DATA, FINISHED = "record", "data", "finished"
 """Keys of a checkpoint: metrics of the training, identity of the data, end of the training."""
-_MOVED = "examples.cleaning_steps."
 REPLACE = "train into another folder, or replace the run by overwrite=True"
 _RESULTS = (
     CHECKPOINTS,
@@ -145,34 +144,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             if damaged := archive.testzip():  # torch.load does not compare the checksums
                 raise zipfile.BadZipFile(f"{damaged} has another checksum")
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        config = _renamed(saved["hyper_parameters"]["config"])
-        saved["hyper_parameters"]["config"] = config
-        if config.pop("ensemble", 1) > 1:
-            raise ValueError("several models in one file are of an earlier version, train again")
-        config["dataset"].pop("cache", None)  # each user has their own
-        config["model"] = _without_delay(config["model"])
+        saved["hyper_parameters"]["config"]["dataset"].pop("cache", None)  # each user has their own
         saved["state_dict"].items()
     except Exception as error:  # a damaged archive or pickle raises nearly anything
         text = f"{path} cannot be read, it may be cut short: {in_one_line(error)}"
         raise ConfigError(text) from error
     return saved
-
-
-def _without_delay(part: Any) -> Any:
-    """Leave out the unused ``delay: null`` that earlier versions recorded for a model."""
-    if not isinstance(part, Mapping):
-        return part
-    return {key: _without_delay(x) for key, x in part.items() if (key, x) != ("delay", None)}
-
-
-def _renamed(part: Any) -> Any:
-    """Replace the paths of classes that have moved since the run was made."""
-    if isinstance(part, list):
-        return [_renamed(item) for item in part]
-    if isinstance(part, Mapping):
-        return {key: _renamed(value) for key, value in part.items()}
-    is_moved = isinstance(part, str) and part.startswith(_MOVED)
-    return part.replace(_MOVED, "pinn_dyn.data.logs.") if is_moved else part
 
 
 def newest_checkpoint(folder: Path) -> tuple[Path | None, dict[str, Any]]:

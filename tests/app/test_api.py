@@ -2,7 +2,6 @@
 
 import itertools
 import re
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -302,17 +301,6 @@ def test_a_delay_of_the_data_reaches_predictions_files_and_environments(tmp_path
     start = torch.zeros(6).double()
     expected = run.model.predict(start, torch.tensor(t), signal).numpy()
     np.testing.assert_allclose(loaded.predict(start, u, t), expected, rtol=1e-6, atol=1e-9)
-
-
-def test_a_run_of_earlier_versions_without_a_learned_delay_loads(tmp_path, lnn_run):
-    """Their configuration has the key delay of the model, empty."""
-    folder = shutil.copytree(lnn_run, tmp_path / "run")
-    path = folder / "checkpoints" / "best.ckpt"
-    saved = torch.load(path, weights_only=True)
-    saved["hyper_parameters"]["config"]["model"]["delay"] = None
-    torch.save(saved, path)
-    expected = pinn_dyn.load(lnn_run).model.state_dict()
-    torch.testing.assert_close(pinn_dyn.load(folder).model.state_dict(), expected)
 
 
 def test_a_training_leaves_the_random_numbers_and_the_threads_alone():

@@ -150,15 +150,6 @@ def test_the_bodies_of_the_file_are_the_start_and_generic_ones_have_a_wide_prior
         KnownMechanics(statistics(4), chain, spread={"arm": 1.0})
 
 
-def test_a_checkpoint_of_an_earlier_version_has_the_same_spread_for_all_bodies():
-    chain = RigidChain(TREE.replace("0.7", "-0.7"))
-    model = KnownMechanics(statistics(5), chain, spread=0.5)
-    state = model.state_dict()
-    del state["bodies.spread"]
-    model.load_state_dict(state)
-    assert model.bodies.spread.unique().tolist() == [0.5]
-
-
 def test_standardized_constants():
     positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"], ["kg", "kg"])
     real = RealConstants(torch.tensor([4.0]), ["c"], ["N"])
