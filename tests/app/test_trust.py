@@ -5,11 +5,9 @@ import re
 import pytest
 
 from pinn_dyn.app.config import CONF
-from pinn_dyn.data.logs import SubtractStart
 from pinn_dyn.run.configuration import trust
-from pinn_dyn.run.configuration.build import build_part
 from pinn_dyn.run.configuration.validation import ConfigError
-from pinn_dyn.run.run_folder import load_run, read_checkpoint
+from pinn_dyn.run.run_folder import load_run
 from tests.app.entry import run_script
 from tests.support.foreign_runs import foreign
 
@@ -41,15 +39,6 @@ def test_an_own_class_is_built_where_its_package_is_trusted(tmp_path, lnn_run):
     for name in ("my", "my_arm", "other"):
         with pytest.raises(ConfigError, match="may name the classes"):
             load_run(run, "best", (name,))
-
-
-def test_a_run_names_classes_that_have_moved_since(tmp_path, lnn_run):
-    steps = {"start": {"_target_": "examples.cleaning_steps.SubtractStart", "samples": 3}}
-    run = foreign(lnn_run, tmp_path / "run", lambda c: c["dataset"].update(steps=steps))
-    saved = read_checkpoint(run / "checkpoints" / "best.ckpt")
-    part = saved["hyper_parameters"]["config"]["dataset"]["steps"]["start"]
-    assert build_part("start", part) == SubtractStart(3)
-    assert trust.may_build(part["_target_"], ())
 
 
 @pytest.mark.usefixtures("my_package")
