@@ -73,6 +73,8 @@ class Compiled:
         evaluations, on_cpu = self.evaluations(windows), windows.q.device.type == "cpu"
         # On a GPU a program replaces thousands of launches.
         long = not on_cpu or self.steps >= STEPS_FOR_PROGRAM
+        if evaluations == 0:  # of a rollout with joints that stick, which has no derivative
+            return None
         if evaluations > 1 and (evaluations > MOST_EVALUATIONS or not long):
             return None
         return CHUNK * MOST_EVALUATIONS // evaluations if on_cpu else len(windows)

@@ -13,6 +13,7 @@ from pinn_dyn.models import (
     AccelerationMLP,
     ConstantCholesky,
     ConstantInput,
+    CoulombFriction,
     LagrangianNetwork,
     LearnedVelocity,
     NetworkPotential,
@@ -21,6 +22,7 @@ from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager
 from pinn_dyn.training.loss_program import LossProgram
 from tests.models.builders import make_model, make_structured, perturb
+from tests.support.known import known_model, statistics, windows_of
 from tests.support.windows import make_windows, one_step, spread_out
 
 
@@ -162,3 +164,12 @@ def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
     monkeypatch.setattr(compiled, "_loss", lambda part: seen.append(len(part)) or loss(model, part))
     assert_same(compiled(batch), Eager(loss, model, compiled.vector)(batch))
     assert seen == [9, 8, 8]
+
+
+def test_joints_that_stick_are_compiled_without_a_program():
+    """Their rollouts do not call the state derivative, which the size of a program counts."""
+    model = known_model(friction=CoulombFriction)
+    windows = windows_of(model, count=4, steps=2)
+    loss = IncrementLoss(statistics(model.num_coordinates), model).double()
+    assert model.sticking
+    assert engine(Compiled, loss, model, STEPS_FOR_PROGRAM).step(windows, None) is None
