@@ -130,23 +130,24 @@ def block_scores(
     return dual @ covariance @ dual.T
 
 
-def left_out(z: Tensor, slopes: Tensor, errors: Tensor, blocks: Tensor, root: Tensor) -> Tensor:
-    """Return z of a fit without each of B blocks, by a Gauss-Newton step, ``(B, P)``::
+def left_out(
+    z: Tensor, slopes: Tensor, errors: Tensor, parts: Sequence[Tensor], root: Tensor
+) -> Tensor:
+    """Return z of a fit without each of B parts, by a Gauss-Newton step, ``(B, P)``::
 
         z_b = z + (H - J_b^T J_b)^-1 J_b^T r_b,    H = J^T J + R^T R
 
     Source: Quenouille (1956), "Notes on bias in estimation" (the jackknife).
 
     Args:
-        z: the minimum with all blocks, ``(P,)``.
+        z: the minimum with all parts, ``(P,)``.
         slopes, errors, root: see :func:`block_scores`.
-        blocks: block number of each residual, ``(K,)``.
+        parts: true for the residuals of each part, ``(K,)`` each.
     """
     precision, fits = slopes.T @ slopes + root.T @ root, []
-    for number in blocks.unique():
-        part = slopes[blocks == number]
-        score = part.T @ errors[blocks == number]
-        fits.append(z + torch.linalg.solve(precision - part.T @ part, score))
+    for part in parts:
+        rows = slopes[part]
+        fits.append(z + torch.linalg.solve(precision - rows.T @ rows, rows.T @ errors[part]))
     return torch.stack(fits)
 
 

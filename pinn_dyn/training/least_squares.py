@@ -376,6 +376,7 @@ class LeastSquares:
         labels = [torch.from_numpy(near)[:, None, None], speeds]
         partitions = [label.expand(size).flatten() for label in labels]
         origins = _runs_of(windows, runs)[:, None, None].expand(size).flatten()
+        parts = [origins == number for number in range(len(runs))]
         return self._solve(
             stage,
             model,
@@ -386,7 +387,7 @@ class LeastSquares:
             self.evaluations,
             1.0,
             robust=self.loss == "soft_l1",
-            origins=origins if len(runs) >= _FEWEST_RUNS else None,
+            parts=parts if len(parts) >= _FEWEST_RUNS else None,
         )
 
     def _solve(
@@ -400,12 +401,12 @@ class LeastSquares:
         limit: int,
         tolerance: float,
         robust: bool,
-        origins: Tensor | None = None,
+        parts: Sequence[Tensor] | None = None,
     ) -> Fit:
         """Fit from the present z; ``group`` residuals count as one.
 
-        The tolerance is in units of the standard deviation of the cost by the noise. The fits
-        without each run need the numbers ``origins`` of the runs of all residuals.
+        The tolerance is in units of the standard deviation of the cost by the noise. The
+        result has fits without each of the ``parts``, see :func:`~.constants_fit.left_out`.
         """
         task = f"least squares, {stage}"
         z = parameters_to_vector(model.parameters()).detach()
@@ -426,9 +427,9 @@ class LeastSquares:
         result = Fit(
             covariance, information, prior, problem.noise, problem.steps, problem.z, scores=scores
         )
-        if origins is None:
+        if parts is None:
             return result
-        fits = left_out(problem.z, problem.slopes, problem.data, origins, prior.root)
+        fits = left_out(problem.z, problem.slopes, problem.data, parts, prior.root)
         return replace(result, left_out=fits)
 
 
