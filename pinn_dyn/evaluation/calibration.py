@@ -68,13 +68,25 @@ def standardized_errors(prediction: Prediction) -> Tensor:
     return torch.where(diverged_trajectories(prediction)[:, None, None], torch.inf, ratio)
 
 
+def corrected_width(validation: Prediction, level: float | np.ndarray = LEVEL) -> np.ndarray:
+    """Return half the width that contains the share ``level`` of the errors of the validation.
+
+    It is in the units of :func:`half_widths`, and infinite if more rollouts diverge. Errors where
+    all members agree do not count, since no width contains them.
+    """
+    counts = validation.deviation()[:, 1:] != 0
+    errors = standardized_errors(validation)[counts].numpy()
+    errors = errors if len(errors) else np.array([np.inf])
+    return np.asarray(np.quantile(errors, level, method="higher"))
+
+
 def calibration(held_out: Prediction, validation: Prediction | None) -> Calibration:
     """Compare nominal levels of intervals with their coverage, over all coordinates and times.
 
     The interval of level p is q_hat +- c_p sqrt(1 + 1/E) s. According to the members, c_p is the
     quantile of :func:`half_widths`. The corrected c_p contains the share p of the validation
-    errors. Source: Lei et al. 2018, "Distribution-free predictive inference for regression", sec.
-    5.2 (locally weighted conformal inference).
+    errors, see :func:`corrected_width`. Source: Lei et al. 2018, "Distribution-free predictive
+    inference for regression", sec. 5.2 (locally weighted conformal inference).
 
     Args:
         held_out: rollouts with members, of motions that took no part in training.
@@ -86,8 +98,7 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
     share = _within(errors, width)
     if validation is None:
         return Calibration(_LEVELS, share)
-    validation_errors = standardized_errors(validation).flatten().numpy()
-    corrected = np.quantile(validation_errors, _LEVELS, method="higher")
+    corrected = corrected_width(validation, _LEVELS)
     return Calibration(_LEVELS, share, _within(errors, corrected), corrected[_AT] / width[_AT])
 
 

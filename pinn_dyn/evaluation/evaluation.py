@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
@@ -19,7 +19,7 @@ from pinn_dyn.evaluation.metrics import (
     rollout_metrics,
     state_squared_error,
 )
-from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
+from pinn_dyn.evaluation.prediction import Prediction, predict_with_members
 from pinn_dyn.evaluation.report.prediction_page import Evaluation
 from pinn_dyn.evaluation.tables import (
     over_seeds,
@@ -142,14 +142,10 @@ def evaluate_models(
 def _predict(
     entry: Entry, truth: Trajectory, stride: int, window: float | None = None
 ) -> Prediction:
-    def rollout(model: Predictor) -> Prediction:
-        prediction = predict_trajectories(model, truth, window=window, step=entry.step)
-        return prediction.every(stride // samples_of("step", entry.step, truth.t))
-
-    prediction = rollout(entry.model)
-    if entry.members is None or entry.members is entry.model:
-        return prediction
-    return replace(prediction, members=rollout(entry.members).members)
+    prediction = predict_with_members(
+        entry.model, entry.members, truth, window=window, step=entry.step
+    )
+    return prediction.every(stride // samples_of("step", entry.step, truth.t))
 
 
 def _calibration(

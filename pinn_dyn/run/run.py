@@ -19,10 +19,10 @@ from torch import Tensor
 
 from pinn_dyn.data import DataSource, LogSource, RobotSource, data_changes, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
-from pinn_dyn.evaluation.calibration import half_widths
+from pinn_dyn.evaluation.calibration import corrected_width, half_widths
 from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import score
-from pinn_dyn.evaluation.prediction import model_for_rollouts
+from pinn_dyn.evaluation.prediction import model_for_rollouts, predict_with_members
 from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.exports.exported import Real
 from pinn_dyn.exports.watch import Watch
@@ -33,6 +33,7 @@ from pinn_dyn.mechanics import (
     MechanicalSystem,
     Predictor,
     Signal,
+    stack_until,
 )
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
@@ -380,7 +381,7 @@ class Run:
         u: Values,
         t: Values,
         level: float = 0.95,
-        factor: float = 1.0,
+        factor: float | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the interval that contains the motion with the probability ``level``::
 
@@ -388,9 +389,15 @@ class Run:
 
         s is the spread of E predictions: those of the members of an ensemble, or of draws of the
         constants that least squares fitted. c is the quantile of Student's t with E - 1 degrees of
-        freedom. Measurement noise and errors that all members share are not included; evaluate.py
-        reports the ``factor`` that validation motions needed, in ``summary.csv``. The width is zero
-        where a joint sticks in all predictions.
+        freedom. The factor is the one that the validation motions need over the time of t, so that
+        it covers errors that all members share. The width is zero where a joint sticks in all
+        predictions.
+
+        Args:
+            start, u, t: see :meth:`predict`.
+            level: probability.
+            factor: factor, such as that of ``summary.csv``; 1 for the spread alone, which needs no
+                data. None predicts the validation motions.
 
         Returns:
             The lower and the upper ends, ``(*batch, T, 2N)`` each.
@@ -406,9 +413,20 @@ class Run:
         with torch.no_grad():
             paths = model_for_rollouts(ensemble).member_increments(x0, times, signal)
             mean = self._for_rollouts().predict(x0, times, signal)
-        width = float(half_widths(len(paths), level)) * (1 + 1 / len(paths)) ** 0.5
-        reach = factor * width * paths.std(dim=0)
+        if factor is None:
+            width = self._corrected_width(ensemble, float(times[-1] - times[0]), level)
+        else:
+            width = factor * float(half_widths(len(paths), level))
+        deviation = paths.std(dim=0) * (1 + 1 / len(paths)) ** 0.5
+        reach = torch.where(deviation == 0, 0.0, width * deviation)  # the width may be infinite
         return (mean - reach).numpy(), (mean + reach).numpy()
+
+    def _corrected_width(self, ensemble: Ensemble, duration: float, level: float) -> float:
+        motions = stack_until(self.source.load().validation)
+        step = self.model.fixed_step or self.statistics.step
+        window = step * max(int(min(duration, motions.duration) / step + 1e-6), 1)
+        prediction = predict_with_members(self.model, ensemble, motions, window=window, step=step)
+        return float(corrected_width(prediction, level))
 
     def _for_rollouts(self, threads: int = 1) -> Predictor:
         """Return the model with loops in C, copied once for its present numbers and attributes."""

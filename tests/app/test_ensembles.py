@@ -35,7 +35,12 @@ def test_the_mean_of_seeds_is_evaluated_beside_the_runs(tmp_path, folders, run_o
     assert np.isfinite([row["spread_mean"], row["spread_over_error"]]).all()
     # 0.02 s is shorter than the validation motions, so widths are corrected too.
     assert 0 <= mean["window_0.02s_within"] <= 1
-    assert mean["window_0.02s_factor"] > 0
+    factor = mean["window_0.02s_factor"]
+    run = pinn_dyn.ensemble([pinn_dyn.load(folder) for folder in folders])
+    motion = np.zeros(6), np.ones((11, 3)), np.linspace(0, 0.02, 11)
+    low, high = run.predict_interval(*motion)
+    narrow = run.predict_interval(*motion, factor=1)
+    np.testing.assert_allclose(high - low, factor * (narrow[1] - narrow[0]), rtol=1e-6)
     assert np.isnan(table.loc["mlp seed 0", "window_0.02s_within"])
 
 
@@ -52,14 +57,14 @@ def test_an_interval_holds_the_predictions_of_the_members(folders):
     start, u = np.zeros(6), np.ones((6, 3))
     each = np.stack([member.predict(start, u, t) for member in run.members])
     assert (each[0] != each[1]).any()
-    low, high = run.predict_interval(start, u, t)
+    low, high = run.predict_interval(start, u, t, factor=1)
     # Student's t with one degree of freedom at 97.5 %.
     reach = 12.7062 * (3 / 2) ** 0.5 * each.std(axis=0, ddof=1)
     np.testing.assert_allclose(0.5 * (low + high), each.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(0.5 * (high - low), reach, rtol=1e-4, atol=1e-9)
     twice = run.predict_interval(start, u, t, factor=2)
     np.testing.assert_allclose(twice[1] - twice[0], 2 * (high - low))
-    narrow = run.predict_interval(start, u, t, level=0.5)
+    narrow = run.predict_interval(start, u, t, level=0.5, factor=1)
     assert (narrow[1] - narrow[0] <= high - low).all()
     np.testing.assert_allclose(run.predict(start, u, t), each.mean(axis=0), atol=1e-12)
 

@@ -59,6 +59,7 @@ def test_a_rollout_that_broke_down_lies_in_no_interval():
     assert errors[10:].isfinite().all()
     found = calibration(item, None)
     assert found.share[-1] == pytest.approx(0.75 * 0.99, abs=0.01)
+    assert calibration(item, item).factor == math.inf
 
 
 def test_members_that_agree_on_something_else_lie_in_no_interval():
@@ -66,7 +67,7 @@ def test_members_that_agree_on_something_else_lie_in_no_interval():
     item.members[:, :20] = item.q_hat[:20]
     errors = standardized_errors(item)
     assert errors[:20].isinf().all()
-    # Nor do they say a width where validation needs one.
-    found = calibration(prediction(1), item)
-    assert found.factor == math.inf
-    assert found.corrected[-1] == 1.0
+    # They do not widen the intervals of the others.
+    found = calibration(item, item)
+    assert found.factor == pytest.approx(1, rel=0.05)
+    assert found.within_corrected == pytest.approx(0.95 / 2, abs=0.01)
