@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -86,6 +87,8 @@ def evaluate_models(
     predictions: dict[str, Prediction] = {}
     intervals: dict[str, dict[float, Calibration]] = {}
     progress.total = len(entries) + len(baselines)
+    share_data = all(entry.training is entries[0].training for entry in entries)
+    validates = split == "test" and len(entries) > 1 and share_data
     for index, entry in enumerate([*entries, *baselines]):
         model, run = entry.model, entry.run
         progress.update(index, f", now {run}")
@@ -94,6 +97,8 @@ def evaluate_models(
         item = predictions[run] = _predict(entry, truth, stride)
         row |= rollout_metrics(item.q_hat, item.q, item.t, thresholds=thresholds).to_dict()
         row |= state_squared_error(item) | left_data(item, entry.training.train)
+        if validates and index < len(entries):
+            row["validation_error_mean"] = _validation_error(entry, truth.duration, stride)
         if item.members is not None:
             ensembles.append({"run": run, **member_metrics(item)})
         for window in windows:
@@ -146,6 +151,15 @@ def _predict(
         entry.model, entry.members, truth, window=window, step=entry.step
     )
     return prediction.every(stride // samples_of("step", entry.step, truth.t))
+
+
+def _validation_error(entry: Entry, horizon: float, stride: int) -> float:
+    """Return the mean error on the validation data, infinite if a rollout diverged."""
+    motions = stack_until(entry.training.validation)
+    motions = motions.until(min(horizon, motions.duration))
+    item = _predict(entry, motions, stride)
+    metrics = rollout_metrics(item.q_hat, item.q, item.t, thresholds={})
+    return math.inf if metrics.diverged else metrics.error_mean
 
 
 def _calibration(

@@ -44,6 +44,20 @@ def test_the_mean_of_seeds_is_evaluated_beside_the_runs(tmp_path, folders, run_o
     assert np.isnan(table.loc["mlp seed 0", "window_0.02s_within"])
 
 
+def test_the_run_that_validation_prefers_is_named(folders, run_of):
+    """Chosen by the test data, a run would look better than it is."""
+    runs = [pinn_dyn.load(folder) for folder in (folders[0], run_of("mlp"))]
+    test, validation = (
+        pinn_dyn.evaluate(runs, split=x, horizon=0.1) for x in ("test", "validation")
+    )
+    errors = validation.summary.set_index("run")["error_mean"][["lnn", "mlp"]]
+    chosen = test.summary.set_index("run")["validation_error_mean"]
+    pd.testing.assert_series_equal(chosen[["lnn", "mlp"]], errors, check_names=False)
+    assert chosen[2:].isna().all()
+    assert f"The validation data prefer '{errors.idxmin()}'" in str(test)
+    assert "prefer" not in str(validation)
+
+
 def test_runs_without_another_seed_have_no_mean(tmp_path, folders, run_of, capsys):
     runs = f"runs=[{folders[0]},{run_of('mlp')}]"
     words = runs, "ensemble=true", f"hydra.run.dir={tmp_path}"

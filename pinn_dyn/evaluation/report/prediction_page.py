@@ -35,6 +35,7 @@ from pinn_dyn.evaluation.report.page import (
 )
 from pinn_dyn.evaluation.tables import (
     SEEDS_COLUMNS,
+    preferred_run,
     summary_columns,
     to_text,
     unbeaten_baselines,
@@ -124,6 +125,7 @@ class Evaluation:
             f"{self.source.name}: {self.trajectories}",
             to_text(self.summary, summary_columns(self.summary)),
             "* best in its column, and better than all baselines (in brackets)",
+            *preferred_run(self.summary),
             *unbeaten_baselines(self.summary),
         ]
         if len(self.by_model) < len(self.summary):
@@ -216,6 +218,7 @@ def _summary(item: Evaluation) -> Iterator[Markup]:
         "better than all baselines. All columns are in summary.csv."
     )
     yield table(item.summary, headers=summary_columns(item.summary))
+    yield from map(paragraph, preferred_run(item.summary))
     yield from map(paragraph, unbeaten_baselines(item.summary))
     if len(item.by_model) < len(item.summary):
         yield table(item.by_model, headers=SEEDS_COLUMNS)
