@@ -68,6 +68,7 @@ def of_python(monkeypatch, source, model, **arguments):
         raise InterruptedError
 
     monkeypatch.setattr("pinn_dyn.run.training.claimed", stop)
+    monkeypatch.setattr("pinn_dyn.run.known_data.turning", lambda source: [])  # needs no data
     with pytest.raises(InterruptedError):
         pinn_dyn.train(source, model, **arguments)
     (config,) = configs
