@@ -385,19 +385,18 @@ class Run:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the interval that contains the motion with the probability ``level``::
 
-            x(t) +- factor c sqrt(1 + 1/E) s(t)
+            x(t) +- c sqrt((1 + 1/E) s(t)^2 + m^2)
 
         s is the spread of E predictions: those of the members of an ensemble, or of draws of the
-        constants that least squares fitted. c is the quantile of Student's t with E - 1 degrees of
-        freedom. The factor is the one that the validation motions need over the time of t, so that
-        it covers errors that all members share. The width is zero where a joint sticks in all
-        predictions.
+        constants that least squares fitted. c and m are those that the validation motions need over
+        the time of t, see :func:`~.evaluation.calibration.corrected_width`; m of v follows from
+        that of q by the spreads of v and q in the training. The width is zero at the start.
 
         Args:
             start, u, t: see :meth:`predict`.
             level: probability.
-            factor: factor, such as that of ``summary.csv``; 1 for the spread alone, which needs no
-                data. None predicts the validation motions.
+            factor: for intervals of the spread alone, without data: m is zero, and c the factor
+                times the quantile of Student's t with E - 1 degrees of freedom.
 
         Returns:
             The lower and the upper ends, ``(*batch, T, 2N)`` each.
@@ -413,20 +412,26 @@ class Run:
         with torch.no_grad():
             paths = model_for_rollouts(ensemble).member_increments(x0, times, signal)
             mean = self._for_rollouts().predict(x0, times, signal)
-        if factor is None:
-            width = self._corrected_width(ensemble, float(times[-1] - times[0]), level)
+        variance = paths.var(dim=0) * (1 + 1 / len(paths))
+        if factor is not None:
+            reach = factor * float(half_widths(len(paths), level)) * variance.sqrt()
         else:
-            width = factor * float(half_widths(len(paths), level))
-        deviation = paths.std(dim=0) * (1 + 1 / len(paths)) ** 0.5
-        reach = torch.where(deviation == 0, 0.0, width * deviation)  # the width may be infinite
+            floor, width = self._corrected_width(ensemble, float(times[-1] - times[0]), level)
+            reach = width * (variance + floor**2).sqrt()
+            reach[..., 0, :] = 0.0
         return (mean - reach).numpy(), (mean + reach).numpy()
 
-    def _corrected_width(self, ensemble: Ensemble, duration: float, level: float) -> float:
+    def _corrected_width(
+        self, ensemble: Ensemble, duration: float, level: float
+    ) -> tuple[Tensor, float]:
+        """Return the floors of x ``(2N,)`` and c of :func:`.corrected_width`."""
         motions = stack_until(self.source.load().validation)
         step = self.model.fixed_step or self.statistics.step
         window = step * max(int(min(duration, motions.duration) / step + 1e-6), 1)
         prediction = predict_with_members(self.model, ensemble, motions, window=window, step=step)
-        return float(corrected_width(prediction, level))
+        floor, width = corrected_width(prediction, level)
+        rate = self.statistics.v_std if self.model.state == "qv" else self.statistics.p_std
+        return torch.cat([floor, floor * rate / self.statistics.q_std]), float(width)
 
     def _for_rollouts(self, threads: int = 1) -> Predictor:
         """Return the model with loops in C, copied once for its present numbers and attributes."""
