@@ -180,6 +180,21 @@ def logs() -> str:
     return markdown(head, rows)
 
 
+def windows() -> str:
+    """Return errors and processor times of fits on several numbers of windows, and of ``auto``."""
+    rows, columns = [], [SHORT, LONG, "error_mean", "processor_seconds"]
+    for log in ("double_pendulum", "ur10e"):
+        data = task(f"{log}, windows")
+        data = pd.concat([data, task(log).query("model == 'known'")])
+        for count, runs in data.groupby("pairs"):
+            spread = runs[LONG].max() - runs[LONG].min()
+            text = f"{count:.0f}" + (" (auto)" if "known" in runs.index else "")
+            means = [number(runs[name].mean(), digits=3) for name in columns]
+            rows.append([log, text, *means[:2], number(spread), *means[2:]])
+    head = ["log", "windows", "0.1 s", "1 s", "spread", "open loop", "processor, s"]
+    return markdown(head, rows)
+
+
 def intervals() -> str:
     """Return the share of errors within 95 % intervals, raw and scaled on validation data."""
     columns = [f"window_{t}_within_95{kind}" for kind in ("", "_corrected") for t in ("0.1s", "1s")]

@@ -16,6 +16,7 @@ LEVEL = 0.95
 """Default level of an interval."""
 _LEVELS = np.array([0.05, *np.arange(0.1, 0.91, 0.1), LEVEL, 0.99])
 _AT = -2  # index of LEVEL in _LEVELS
+_SMALLEST = 1e-300  # mean width of members that agree everywhere
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Calibration:
         level: nominal levels, ``(L,)``.
         share: share of the errors within intervals as wide as the members say, ``(L,)``.
         corrected: the same with widths taken from the validation motions, ``(L,)``, or None.
-        factor: corrected width over the members' width at the 95 % level, or None.
+        factor: mean corrected width over that of the members at the 95 % level, or None.
     """
 
     level: np.ndarray
@@ -54,27 +55,40 @@ def half_widths(members: int, level: float | np.ndarray = LEVEL) -> np.ndarray:
     return np.asarray(scipy.stats.t.ppf(0.5 + 0.5 * np.asarray(level), members - 1))
 
 
-def standardized_errors(prediction: Prediction) -> Tensor:
-    """Return |q - q_hat| / (sqrt(1 + 1/E) s), ``(K, T - 1, N)``, with s the spread of E members.
+def standardized_errors(prediction: Prediction, floor: Tensor | float = 0.0) -> Tensor:
+    """Return |q - q_hat| / sqrt((1 + 1/E) s^2 + m^2), ``(K, T - 1, N)``.
 
-    The start is left out. The result is infinite where a rollout diverged, and where the members
-    agree on something else than the truth.
+    s is the spread of E members and m the ``floor``, ``(N,)``. The start is left out. The result is
+    infinite where a rollout diverged, and where the width is zero, but not the error.
     """
-    deviation = prediction.deviation()[:, 1:]
-    assert prediction.members is not None
-    deviation = deviation * (1 + 1 / len(prediction.members)) ** 0.5
     error = (prediction.q - prediction.q_hat).abs()[:, 1:]
-    ratio = torch.where(error > 0, error / deviation, 0.0).nan_to_num(torch.inf, posinf=torch.inf)
+    ratio = torch.where(error > 0, error / _widths(prediction, floor), 0.0)
+    ratio = ratio.nan_to_num(torch.inf, posinf=torch.inf)
     return torch.where(diverged_trajectories(prediction)[:, None, None], torch.inf, ratio)
+
+
+def corrected_width(
+    validation: Prediction, level: float | np.ndarray = LEVEL
+) -> tuple[Tensor, np.ndarray]:
+    """Return m ``(N,)`` and c for intervals q_hat +- c sqrt((1 + 1/E) s^2 + m^2).
+
+    m is the median error of a coordinate in the validation: what the members do not know, such as
+    measurement noise, also where they agree because a joint sticks. c contains the share ``level``
+    of the errors, and is infinite if more rollouts diverge. Source: Lei et al. 2018,
+    "Distribution-free predictive inference for regression", sec. 5.2 (locally weighted conformal
+    inference).
+    """
+    error = (validation.q - validation.q_hat).abs()[:, 1:]
+    floor = error.flatten(0, 1).nanmedian(dim=0).values
+    errors = standardized_errors(validation, floor).flatten().numpy()
+    return floor, np.asarray(np.quantile(errors, level, method="higher"))
 
 
 def calibration(held_out: Prediction, validation: Prediction | None) -> Calibration:
     """Compare nominal levels of intervals with their coverage, over all coordinates and times.
 
     The interval of level p is q_hat +- c_p sqrt(1 + 1/E) s. According to the members, c_p is the
-    quantile of :func:`half_widths`. The corrected c_p contains the share p of the validation
-    errors. Source: Lei et al. 2018, "Distribution-free predictive inference for regression", sec.
-    5.2 (locally weighted conformal inference).
+    quantile of :func:`half_widths`. The corrected interval is that of :func:`corrected_width`.
 
     Args:
         held_out: rollouts with members, of motions that took no part in training.
@@ -86,9 +100,18 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
     share = _within(errors, width)
     if validation is None:
         return Calibration(_LEVELS, share)
-    validation_errors = standardized_errors(validation).flatten().numpy()
-    corrected = np.quantile(validation_errors, _LEVELS, method="higher")
-    return Calibration(_LEVELS, share, _within(errors, corrected), corrected[_AT] / width[_AT])
+    floor, corrected = corrected_width(validation, _LEVELS)
+    errors = standardized_errors(held_out, floor).flatten().numpy()
+    means = [float(_widths(validation, x).nanmean()) for x in (floor, 0.0)]
+    factor = corrected[_AT] * means[0] / (width[_AT] * max(means[1], _SMALLEST))
+    return Calibration(_LEVELS, share, _within(errors, corrected), float(factor))
+
+
+def _widths(prediction: Prediction, floor: Tensor | float) -> Tensor:
+    """Return sqrt((1 + 1/E) s^2 + m^2), ``(K, T - 1, N)``."""
+    assert prediction.members is not None
+    variance = prediction.deviation()[:, 1:].square() * (1 + 1 / len(prediction.members))
+    return (variance + floor**2).sqrt()
 
 
 def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
@@ -19,7 +20,7 @@ from pinn_dyn.evaluation.metrics import (
     rollout_metrics,
     state_squared_error,
 )
-from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
+from pinn_dyn.evaluation.prediction import Prediction, predict_with_members
 from pinn_dyn.evaluation.results import Evaluation
 from pinn_dyn.evaluation.tables import (
     over_seeds,
@@ -86,6 +87,8 @@ def evaluate_models(
     predictions: dict[str, Prediction] = {}
     intervals: dict[str, dict[float, Calibration]] = {}
     progress.total = len(entries) + len(baselines)
+    share_data = all(entry.training is entries[0].training for entry in entries)
+    validates = split == "test" and len(entries) > 1 and share_data
     for index, entry in enumerate([*entries, *baselines]):
         model, run = entry.model, entry.run
         progress.update(index, f", now {run}")
@@ -94,6 +97,8 @@ def evaluate_models(
         item = predictions[run] = _predict(entry, truth, stride)
         row |= rollout_metrics(item.q_hat, item.q, item.t, thresholds=thresholds).to_dict()
         row |= state_squared_error(item) | left_data(item, entry.training.train)
+        if validates and index < len(entries):
+            row["validation_error_mean"] = _validation_error(entry, truth.duration, stride)
         if item.members is not None:
             ensembles.append({"run": run, **member_metrics(item)})
         for window in windows:
@@ -142,14 +147,19 @@ def evaluate_models(
 def _predict(
     entry: Entry, truth: Trajectory, stride: int, window: float | None = None
 ) -> Prediction:
-    def rollout(model: Predictor) -> Prediction:
-        prediction = predict_trajectories(model, truth, window=window, step=entry.step)
-        return prediction.every(stride // samples_of("step", entry.step, truth.t))
+    prediction = predict_with_members(
+        entry.model, entry.members, truth, window=window, step=entry.step
+    )
+    return prediction.every(stride // samples_of("step", entry.step, truth.t))
 
-    prediction = rollout(entry.model)
-    if entry.members is None or entry.members is entry.model:
-        return prediction
-    return replace(prediction, members=rollout(entry.members).members)
+
+def _validation_error(entry: Entry, horizon: float, stride: int) -> float:
+    """Return the mean error on the validation data, infinite if a rollout diverged."""
+    motions = stack_until(entry.training.validation)
+    motions = motions.until(min(horizon, motions.duration))
+    item = _predict(entry, motions, stride)
+    metrics = rollout_metrics(item.q_hat, item.q, item.t, thresholds={})
+    return math.inf if metrics.diverged else metrics.error_mean
 
 
 def _calibration(

@@ -124,6 +124,28 @@ def predict_trajectories(
     return Prediction(t, paths.mean(0), q, members, v_hat, v_true)
 
 
+def predict_with_members(
+    model: Predictor,
+    members: Predictor | None,
+    truth: Trajectory,
+    *,
+    window: float | None = None,
+    step: float | None = None,
+) -> Prediction:
+    """Roll out a model as :func:`predict_trajectories`, and the members of an ensemble beside it.
+
+    Args:
+        model: the model, or the ensemble itself.
+        members: ensemble whose members give the spread, such as draws of constants, or None.
+        truth, window, step: see :func:`predict_trajectories`.
+    """
+    prediction = predict_trajectories(model, truth, window=window, step=step)
+    if members is None or members is model:
+        return prediction
+    beside = predict_trajectories(members, truth, window=window, step=step)
+    return replace(prediction, members=beside.members)
+
+
 def model_for_rollouts(
     model: Model, device: torch.device | str = "cpu", threads: PositiveInt = 1
 ) -> Model:

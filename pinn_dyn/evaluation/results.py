@@ -36,6 +36,7 @@ from pinn_dyn.evaluation.report.prediction_page import (
 )
 from pinn_dyn.evaluation.tables import (
     SEEDS_COLUMNS,
+    preferred_run,
     summary_columns,
     to_text,
     unbeaten_baselines,
@@ -124,6 +125,7 @@ class Evaluation:
             f"{self.source.name}: {self.trajectories}",
             to_text(self.summary, summary_columns(self.summary)),
             "* best in its column, and better than all baselines (in brackets)",
+            *preferred_run(self.summary),
             *unbeaten_baselines(self.summary),
         ]
         if len(self.by_model) < len(self.summary):

@@ -26,6 +26,7 @@ _WINDOW = r"window_(.*)s_error_mean"
 _HEADERS = {
     "run": "run",
     "error_mean": "mean error ± std",
+    "validation_error_mean": "validation",
     "error_worst": "worst trajectory",
     "diverged": "diverged",
     "left_data": "left the data",
@@ -213,6 +214,15 @@ def unbeaten_baselines(summary: pd.DataFrame) -> list[str]:
                 f"{number(row[name])}."
             )
     return lines
+
+
+def preferred_run(summary: pd.DataFrame) -> list[str]:
+    """Return a sentence about the run with the smallest error on the validation data, if known."""
+    if "validation_error_mean" not in summary:
+        return []
+    row = summary.loc[summary["validation_error_mean"].idxmin()]
+    error = number(row["validation_error_mean"])
+    return [f"The validation data prefer '{row['run']}': validation_error_mean {error}."]
 
 
 def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -61,51 +61,6 @@ def _refuse_force_without_changes(
         )
 
 
-class MeasuredCoordinates(nn.Module):
-    """y = (q, v) of x = (z, z') whose first N latent coordinates are q: v = z'.
-
-    Args:
-        size: number n of latent coordinates.
-        speed: v_std step / q_std, ``(N,)``: a normalized v in normalized q per step.
-    """
-
-    speed: Tensor
-
-    def __init__(self, size: int, speed: Tensor):
-        super().__init__()
-        self.hidden = size - len(speed)
-        self.register_buffer("speed", speed)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return the normalized y, ``(*batch, 2N)``."""
-        q, _, v, _ = x.split([len(self.speed), self.hidden] * 2, dim=-1)
-        return torch.cat([q, v / self.speed], dim=-1)
-
-    def latent(self, y: Tensor, hidden: Tensor) -> Tensor:
-        """Return x of y and of the hidden coordinates and their rates, ``(*batch, 2n - 2N)``."""
-        (q, v), (z, rate) = y.chunk(2, dim=-1), hidden.chunk(2, dim=-1)
-        return torch.cat([q, z, self.speed * v, rate], dim=-1)
-
-
-class HiddenStart(nn.Module):
-    """Encoder of the hidden coordinates and their rates, with the measured ones as they are."""
-
-    def __init__(
-        self,
-        output: MeasuredCoordinates,
-        inputs: int,
-        hidden: Sequence[PositiveInt],
-        activation: Activation,
-    ):
-        super().__init__()
-        self.output, self._measured = output, 2 * len(output.speed)
-        self.network = LinearAndMLP(inputs, 2 * output.hidden, hidden, activation)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return the latent state of the normalized q, v, past and u."""
-        return self.output.latent(x[..., : self._measured], self.network(x))
-
-
 class CoupledOscillators(EncodedPredictor):
     r"""Oscillators in latent coordinates with stiffness, damping and coupling::
 
@@ -134,10 +89,7 @@ class CoupledOscillators(EncodedPredictor):
 
     Source: Stölzle and Della Santina (2024), "Input-to-state stable coupled oscillator networks for
     closed-form model-based control in latent space". The encoder and the output are those of
-    :class:`EncodedPredictor`, with the latent state (z, z'). With ``output="coordinates"``, z
-    begins with the normalized q, and n - N coordinates are hidden. Then q starts at the measured q
-    without a fading term, and v is the rate of q: q_{k+1} - q_k = h (v_k + v_{k+1}) / 2 over a step
-    h. The encoder gives the hidden coordinates and their rates.
+    :class:`EncodedPredictor`, with the latent state (z, z').
 
     Args:
         statistics: scales of the data.
@@ -145,11 +97,7 @@ class CoupledOscillators(EncodedPredictor):
         oscillators: number n of latent coordinates.
         hidden, activation: widths and activation of the hidden layers of encoder and output.
         force_hidden: widths of the hidden layers of f.
-        output: network of (z, z'), or the first coordinates of z.
-        fade, initial_velocity: see :class:`EncodedPredictor`. fade has no effect on coordinates.
-
-    Raises:
-        ValueError: if ``output="coordinates"`` leaves no hidden coordinate.
+        fade, initial_velocity: see :class:`EncodedPredictor`.
     """
 
     def __init__(
@@ -160,24 +108,12 @@ class CoupledOscillators(EncodedPredictor):
         hidden: Sequence[PositiveInt] = (128,),
         activation: Activation = "tanh",
         force_hidden: Sequence[PositiveInt] = (64,),
-        output: Literal["network", "coordinates"] = "network",
         fade: Annotated[float, Field(gt=0, lt=1)] | None = None,
         initial_velocity: InitialVelocityHead | None = None,
     ):
         self._force_hidden = force_hidden
         sizes = 2 * oscillators, hidden, activation
         super().__init__(statistics, history, *sizes, fade, initial_velocity)
-        if output == "coordinates":
-            self._measure_coordinates(hidden, activation)
-
-    def _measure_coordinates(self, hidden: Sequence[int], activation: Activation) -> None:
-        """Let z begin with q. The offset of the start is zero."""
-        size, n = self.num_coordinates, len(self.bias)
-        if n <= size:
-            raise ValueError(f"model.oscillators is {n}, expected more than the {size} coordinates")
-        speed = self.step * self.std[size : 2 * size] / self.std[:size]
-        self.output = MeasuredCoordinates(n, speed.float())
-        self.encoder = HiddenStart(self.output, len(self.mean), hidden, activation)
 
     def _add_transition(
         self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation

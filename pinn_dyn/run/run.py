@@ -20,10 +20,10 @@ from torch import Tensor
 from pinn_dyn.atomic_files import whole
 from pinn_dyn.data import DataSource, LogSource, RobotSource, data_changes, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws, sampled_models
-from pinn_dyn.evaluation.calibration import half_widths
+from pinn_dyn.evaluation.calibration import corrected_width, half_widths
 from pinn_dyn.evaluation.external_torque import ExternalTorque
 from pinn_dyn.evaluation.metrics import score
-from pinn_dyn.evaluation.prediction import model_for_rollouts
+from pinn_dyn.evaluation.prediction import model_for_rollouts, predict_with_members
 from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.exports.exported_function import Real
 from pinn_dyn.exports.watch import Watch
@@ -34,6 +34,7 @@ from pinn_dyn.mechanics import (
     MechanicalSystem,
     Predictor,
     Signal,
+    stack_until,
 )
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
@@ -380,17 +381,22 @@ class Run:
         u: Values,
         t: Values,
         level: float = 0.95,
-        factor: float = 1.0,
+        factor: float | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the interval that contains the motion with the probability ``level``::
 
-            x(t) +- factor c sqrt(1 + 1/E) s(t)
+            x(t) +- c sqrt((1 + 1/E) s(t)^2 + m^2)
 
         s is the spread of E predictions: those of the members of an ensemble, or of draws of the
-        constants that least squares fitted. c is the quantile of Student's t with E - 1 degrees of
-        freedom. Measurement noise and errors that all members share are not included; evaluate.py
-        reports the ``factor`` that validation motions needed, in ``summary.csv``. The width is zero
-        where a joint sticks in all predictions.
+        constants that least squares fitted. c and m are those that the validation motions need over
+        the time of t, see :func:`~.evaluation.calibration.corrected_width`; m of v follows from
+        that of q by the spreads of v and q in the training. The width is zero at the start.
+
+        Args:
+            start, u, t: see :meth:`predict`.
+            level: probability.
+            factor: for intervals of the spread alone, without data: m is zero, and c the factor
+                times the quantile of Student's t with E - 1 degrees of freedom.
 
         Returns:
             The lower and the upper ends, ``(*batch, T, 2N)`` each.
@@ -406,9 +412,26 @@ class Run:
         with torch.no_grad():
             paths = model_for_rollouts(ensemble).member_increments(x0, times, signal)
             mean = self._for_rollouts().predict(x0, times, signal)
-        width = float(half_widths(len(paths), level)) * (1 + 1 / len(paths)) ** 0.5
-        reach = factor * width * paths.std(dim=0)
+        variance = paths.var(dim=0) * (1 + 1 / len(paths))
+        if factor is not None:
+            reach = factor * float(half_widths(len(paths), level)) * variance.sqrt()
+        else:
+            floor, width = self._corrected_width(ensemble, float(times[-1] - times[0]), level)
+            reach = width * (variance + floor**2).sqrt()
+            reach[..., 0, :] = 0.0
         return (mean - reach).numpy(), (mean + reach).numpy()
+
+    def _corrected_width(
+        self, ensemble: Ensemble, duration: float, level: float
+    ) -> tuple[Tensor, float]:
+        """Return the floors of x ``(2N,)`` and c of :func:`.corrected_width`."""
+        motions = stack_until(self.source.load().validation)
+        step = self.model.fixed_step or self.statistics.step
+        window = step * max(int(min(duration, motions.duration) / step + 1e-6), 1)
+        prediction = predict_with_members(self.model, ensemble, motions, window=window, step=step)
+        floor, width = corrected_width(prediction, level)
+        rate = self.statistics.v_std if self.model.state == "qv" else self.statistics.p_std
+        return torch.cat([floor, floor * rate / self.statistics.q_std]), float(width)
 
     def _for_rollouts(self, threads: int = 1) -> Predictor:
         """Return the model with loops in C, copied once for its present numbers and attributes."""

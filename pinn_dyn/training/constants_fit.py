@@ -43,6 +43,7 @@ class Fit:
         stopped_in: stage in which the fit was interrupted, or None if it is finished.
         scores: covariance of the data's gradient, see :func:`block_scores`; None: the information.
         identified: z after the inverse dynamics, if that was a stage of the fit, ``(P,)``.
+        left_out: z without each of R runs, ``(R, P)``, see :func:`left_out`; None if unknown.
     """
 
     covariance: Tensor
@@ -56,6 +57,7 @@ class Fit:
     stopped_in: int | None = None
     scores: Tensor | None = None
     identified: Tensor | None = None
+    left_out: Tensor | None = None
 
     def state(self) -> dict[str, Any]:
         """Convert to tensors and numbers for a checkpoint."""
@@ -126,6 +128,27 @@ def block_scores(
     covariance = joined.T @ joined
     dual = root.T @ vectors * (1 + values).sqrt()
     return dual @ covariance @ dual.T
+
+
+def left_out(
+    z: Tensor, slopes: Tensor, errors: Tensor, parts: Sequence[Tensor], root: Tensor
+) -> Tensor:
+    """Return z of a fit without each of B parts, by a Gauss-Newton step, ``(B, P)``::
+
+        z_b = z + (H - J_b^T J_b)^-1 J_b^T r_b,    H = J^T J + R^T R
+
+    Source: Quenouille (1956), "Notes on bias in estimation" (the jackknife).
+
+    Args:
+        z: the minimum with all parts, ``(P,)``.
+        slopes, errors, root: see :func:`block_scores`.
+        parts: true for the residuals of each part, ``(K,)`` each.
+    """
+    precision, fits = slopes.T @ slopes + root.T @ root, []
+    for part in parts:
+        rows = slopes[part]
+        fits.append(z + torch.linalg.solve(precision - rows.T @ rows, rows.T @ errors[part]))
+    return torch.stack(fits)
 
 
 def _whitened(information: Tensor, root: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -27,6 +27,7 @@ from pinn_dyn.training.constants_fit import (
     Prior,
     block_scores,
     doubtful_units,
+    left_out,
     posterior_covariance,
 )
 from pinn_dyn.training.filtered_motion import filtered_motion
@@ -51,6 +52,7 @@ _FEWEST_WINDOWS = 10
 _EXACT = 1e-3  # tolerance of the inverse dynamics, whose steps are cheap
 _IMPROVED = 0.95  # of the validation error, from which longer windows follow
 _HELD = 1e3  # root of the precision of constants that are held
+_FEWEST_RUNS = 5  # that can be left out: without one of three, a fit differs by more than a step
 _SATURATED = 0.01  # filtered share of saturated samples, from which a sample is left out
 _DIVERGED = 1e4  # residual of a diverged rollout
 IDENTIFICATION = "inverse dynamics"
@@ -259,7 +261,7 @@ class LeastSquares:
         planned = len(stages) + len(parts)
         for part in [*parts, *(_longer(trajectories, windows) if may_grow else [])]:
             name = f"rollouts of {float(part.t[-1]):.3g} s"
-            stages[name] = partial(self._roll_out, name, model, prior, part)
+            stages[name] = partial(self._roll_out, name, model, prior, trajectories, part)
         return stages, planned
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
@@ -344,7 +346,14 @@ class LeastSquares:
             log.warning("least squares: %s", doubt)
         return result
 
-    def _roll_out(self, stage: str, model: LearnedConstants, prior: Prior, windows: Windows) -> Fit:
+    def _roll_out(
+        self,
+        stage: str,
+        model: LearnedConstants,
+        prior: Prior,
+        runs: Sequence[Trajectory],
+        windows: Windows,
+    ) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()
         scale[:, model.num_coordinates :] /= self.velocity_weight**0.5
         x0, measured = windows.start("qv"), windows.increments("qv")
@@ -366,6 +375,8 @@ class LeastSquares:
         size = residuals(False).shape
         labels = [torch.from_numpy(near)[:, None, None], speeds]
         partitions = [label.expand(size).flatten() for label in labels]
+        origins = _runs_of(windows, runs)[:, None, None].expand(size).flatten()
+        parts = [origins == number for number in range(len(runs))]
         return self._solve(
             stage,
             model,
@@ -376,6 +387,7 @@ class LeastSquares:
             self.evaluations,
             1.0,
             robust=self.loss == "soft_l1",
+            parts=parts if len(parts) >= _FEWEST_RUNS else None,
         )
 
     def _solve(
@@ -389,10 +401,12 @@ class LeastSquares:
         limit: int,
         tolerance: float,
         robust: bool,
+        parts: Sequence[Tensor] | None = None,
     ) -> Fit:
         """Fit from the present z; ``group`` residuals count as one.
 
-        The tolerance is in units of the standard deviation of the cost by the noise.
+        The tolerance is in units of the standard deviation of the cost by the noise. The
+        result has fits without each of the ``parts``, see :func:`~.constants_fit.left_out`.
         """
         task = f"least squares, {stage}"
         z = parameters_to_vector(model.parameters()).detach()
@@ -410,9 +424,13 @@ class LeastSquares:
         scores = block_scores(problem.slopes, problem.data, partitions, prior.root)
         information = problem.slopes.T @ problem.slopes
         covariance = posterior_covariance(information, prior.root, scores)
-        return Fit(
+        result = Fit(
             covariance, information, prior, problem.noise, problem.steps, problem.z, scores=scores
         )
+        if parts is None:
+            return result
+        fits = left_out(problem.z, problem.slopes, problem.data, parts, prior.root)
+        return replace(result, left_out=fits)
 
 
 def _marked(model: LearnedConstants, run: Trajectory) -> Trajectory:
@@ -440,6 +458,14 @@ def _clearly_larger(errors: Tensor, lowest: Tensor) -> bool:
     noise = scipy.stats.t.ppf(_LEVEL, freedom) * excess.std(correction=0) / freedom**0.5
     # A single diverged part has a mean of one standard error, which is not significant.
     return bool(excess.mean() > min(noise, _NOISE * lowest.mean()))
+
+
+def _runs_of(windows: Windows, runs: Sequence[Trajectory]) -> Tensor:
+    """Return the number of the run of each window, ``(B,)``, by the state at its start."""
+    states = torch.cat([run.states("qv") for run in runs])
+    _, rows = scipy.spatial.cKDTree(states.numpy()).query(windows.start("qv").numpy())
+    ends = torch.tensor([len(run.t) for run in runs]).cumsum(0)
+    return torch.searchsorted(ends, torch.from_numpy(rows), right=True)
 
 
 def _longer(trajectories: Sequence[Trajectory], windows: Windows) -> list[Windows]:

@@ -39,6 +39,20 @@ def test_the_mean_of_seeds_is_evaluated_beside_the_runs(tmp_path, folders, run_o
     assert np.isnan(table.loc["mlp seed 0", "window_0.02s_within"])
 
 
+def test_the_run_that_validation_prefers_is_named(folders, run_of):
+    """Chosen by the test data, a run would look better than it is."""
+    runs = [pinn_dyn.load(folder) for folder in (folders[0], run_of("mlp"))]
+    test, validation = (
+        pinn_dyn.evaluate(runs, split=x, horizon=0.1) for x in ("test", "validation")
+    )
+    errors = validation.summary.set_index("run")["error_mean"][["lnn", "mlp"]]
+    chosen = test.summary.set_index("run")["validation_error_mean"]
+    pd.testing.assert_series_equal(chosen[["lnn", "mlp"]], errors, check_names=False)
+    assert chosen[2:].isna().all()
+    assert f"The validation data prefer '{errors.idxmin()}'" in str(test)
+    assert "prefer" not in str(validation)
+
+
 def test_runs_without_another_seed_have_no_mean(tmp_path, folders, run_of, capsys):
     runs = f"runs=[{folders[0]},{run_of('mlp')}]"
     words = runs, "ensemble=true", f"hydra.run.dir={tmp_path}"
@@ -52,16 +66,24 @@ def test_an_interval_holds_the_predictions_of_the_members(folders):
     start, u = np.zeros(6), np.ones((6, 3))
     each = np.stack([member.predict(start, u, t) for member in run.members])
     assert (each[0] != each[1]).any()
-    low, high = run.predict_interval(start, u, t)
+    low, high = run.predict_interval(start, u, t, factor=1)
     # Student's t with one degree of freedom at 97.5 %.
     reach = 12.7062 * (3 / 2) ** 0.5 * each.std(axis=0, ddof=1)
     np.testing.assert_allclose(0.5 * (low + high), each.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(0.5 * (high - low), reach, rtol=1e-4, atol=1e-9)
     twice = run.predict_interval(start, u, t, factor=2)
     np.testing.assert_allclose(twice[1] - twice[0], 2 * (high - low))
-    narrow = run.predict_interval(start, u, t, level=0.5)
+    narrow = run.predict_interval(start, u, t, level=0.5, factor=1)
     assert (narrow[1] - narrow[0] <= high - low).all()
     np.testing.assert_allclose(run.predict(start, u, t), each.mean(axis=0), atol=1e-12)
+    # By default, validation scales the spread, and adds a floor to each coordinate.
+    wide = run.predict_interval(start, u, t)
+    squares = [(0.5 * (b - a))[1:] ** 2 for a, b in (wide, (low, high))]
+    change, expected = (x - x[:1] for x in squares)
+    scale = change.sum() / expected.sum()
+    np.testing.assert_allclose(change, scale * expected, atol=1e-6 * abs(change).max())
+    assert (squares[0] > scale * squares[1]).all()
+    np.testing.assert_array_equal(wide[0][0], wide[1][0])
 
 
 def test_runs_of_other_data_have_no_mean(folders, lnn_run):

@@ -4,12 +4,13 @@ import logging
 import re
 from functools import partial
 
+import pandas as pd
 import pytest
 import torch
 import yaml
 
 from pinn_dyn.data import LogSource
-from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
+from pinn_dyn.models import KnownAndNetwork, KnownMechanics, LagrangianNetwork, Statistics
 from pinn_dyn.run.configuration.validation import ConfigError
 from pinn_dyn.run.training.known_data import check_known, match_model, match_structure
 from pinn_dyn.systems import RigidChain
@@ -47,6 +48,25 @@ def chain(names=NAMES):
 
 def joints_of(columns, names=NAMES, **settings):
     return match_structure(RigidChain(urdf(names), **settings), log_of(columns)).joint_names
+
+
+def test_a_network_gets_the_sine_of_joints_that_turn():
+    """Without it, a network learns the load of a drive again in each revolution."""
+    t = torch.arange(400.0) / 100
+    columns = {"t": t, "wheel": 4 * t, "hand": 3 * t.sin(), "slide": 9 * t, "u": 0 * t}
+    q = dict(columns=["wheel", "hand", "slide"], unit=["rad", "rad", "m"])
+    source = LogSource(
+        files=pd.DataFrame(columns),
+        time=dict(columns="t", unit="s"),
+        q=q,
+        u=dict(columns="u", unit="Nm"),
+        validation=dict(seconds=0.5, piece=0.5),
+        test=dict(seconds=0.5, piece=0.5),
+    )
+    model, changes = match_model(LagrangianNetwork, source)
+    assert changes == {"angles": [0]}
+    assert model.keywords == changes
+    assert match_model(partial(LagrangianNetwork, angles=[1]), source)[1] == {}
 
 
 PANDA = [f"panda_joint{k}" for k in (1, 2, 3)] + ["panda_finger_joint1", "panda_finger_joint2"]

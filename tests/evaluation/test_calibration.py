@@ -33,7 +33,7 @@ def test_members_that_are_too_sure_are_corrected_on_validation():
     found = calibration(prediction(0, narrower=3), prediction(1, narrower=3))
     assert (found.share[:-1] < 0.75 * found.level[:-1]).all()
     assert found.corrected == pytest.approx(found.level, abs=0.02)
-    assert found.factor == pytest.approx(3, rel=0.1)
+    assert 2 < found.factor < 3  # widths that vary less need not be three times as large
     assert found.within == found.share[list(found.level).index(0.95)]
     assert found.within_corrected == pytest.approx(0.95, abs=0.02)
 
@@ -59,6 +59,7 @@ def test_a_rollout_that_broke_down_lies_in_no_interval():
     assert errors[10:].isfinite().all()
     found = calibration(item, None)
     assert found.share[-1] == pytest.approx(0.75 * 0.99, abs=0.01)
+    assert calibration(item, item).factor == math.inf
 
 
 def test_members_that_agree_on_something_else_lie_in_no_interval():
@@ -66,7 +67,6 @@ def test_members_that_agree_on_something_else_lie_in_no_interval():
     item.members[:, :20] = item.q_hat[:20]
     errors = standardized_errors(item)
     assert errors[:20].isinf().all()
-    # Nor do they say a width where validation needs one.
+    # Corrected intervals have a floor, which contains them, too.
     found = calibration(prediction(1), item)
-    assert found.factor == math.inf
-    assert found.corrected[-1] == 1.0
+    assert found.within_corrected > 0.93

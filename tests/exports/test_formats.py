@@ -30,10 +30,10 @@ MODELS = {
     "next_state": lambda: make_model("next_state"),
     "subnet": lambda: make_model("subnet"),
     "oscillators": lambda: make_model("oscillators"),
-    "measured_oscillators": lambda: make_model("measured_oscillators"),
+    "oscillators_of_the_past": lambda: make_model("oscillators_of_the_past"),
 }
 CONSTANT = "constant-mass-fixed-damping-constant-input-3x3"
-FAST = (CONSTANT, "acceleration", "next_state", "oscillators", "measured_oscillators")
+FAST = (CONSTANT, "acceleration", "next_state", "oscillators", "oscillators_of_the_past")
 CASES = [pytest.param(x, marks=() if x in FAST else pytest.mark.slow, id=x) for x in MODELS]
 
 

@@ -159,11 +159,11 @@ def make_model(kind, n=2, m=2, dtype=torch.float64):
         "acceleration": AccelerationMLP,
         "subnet": partial(SubspaceEncoder, history=3 * STEP, latent=5),
         "oscillators": partial(CoupledOscillators, oscillators=3, force_hidden=[4]),
-        "measured_oscillators": partial(
+        "oscillators_of_the_past": partial(
             CoupledOscillators,
             oscillators=4,
             force_hidden=[4],
-            output="coordinates",
+            history=2 * STEP,
             initial_velocity=partial(LearnedVelocity, hidden=[4]),
         ),
     }[kind]

@@ -18,9 +18,9 @@ KINDS = [
     "acceleration",
     "subnet",
     "oscillators",
-    "measured_oscillators",
+    "oscillators_of_the_past",
 ]
-DISCRETE = ("next_state", "subnet", "oscillators", "measured_oscillators")
+DISCRETE = ("next_state", "subnet", "oscillators", "oscillators_of_the_past")
 T = STEP * torch.arange(4, dtype=torch.float64)
 
 

@@ -1,7 +1,6 @@
 """Coupled oscillators in latent coordinates: equations, and bounded rollouts."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import scipy
 import torch
 
 from pinn_dyn.mechanics import Signal
-from pinn_dyn.models import CoupledOscillators, LearnedVelocity
+from pinn_dyn.models import CoupledOscillators
 from pinn_dyn.testing import assert_near
 from tests.models.builders import STEP, make_statistics
 from tests.models.test_subspace_encoder import faded, network
@@ -101,12 +100,11 @@ def test_a_step_follows_the_equation_of_motion():
     assert errors[1] < 0.6 * errors[0] < 0.1
 
 
-@pytest.mark.parametrize("output", ["network", "coordinates"])
 @pytest.mark.parametrize("spread", [0.3, 2.0])
-def test_energy_never_rises_under_a_constant_input(spread, output):
+def test_energy_never_rises_under_a_constant_input(spread):
     """The energy with the potential of the constant force, from far starts, at any parameters."""
     for seed in range(10):
-        model = oscillators(seed, spread, output=output)
+        model = oscillators(seed, spread)
         K, _, W, b = (torch.from_numpy(x) for x in factors(model))
         far = 10 ** (seed % 4) * torch.randn(3, 2 * N, generator=torch.manual_seed(seed)).double()
         path = torch.stack(model.latent_path(far, torch.ones(300, 3, 4).double()))
@@ -144,11 +142,10 @@ def test_rollouts_are_bounded_for_any_parameters(spread):
         assert growth <= step * (1 + 1e-9)
 
 
-@pytest.mark.parametrize("output", ["network", "coordinates"])
 @pytest.mark.parametrize("spread", [0.1, 1.0])
-def test_modes_are_those_of_a_difference_quotient_of_a_step(spread, output):
+def test_modes_are_those_of_a_difference_quotient_of_a_step(spread):
     """Eigenvalues and vectors by NumPy, at the state where a long rollout comes to rest."""
-    model = oscillators(3, spread, output=output)
+    model = oscillators(3, spread)
     u = torch.tensor([0.3, -0.2]).double()
     memory = torch.zeros(model.memory_size).double()
     for _ in range(3000):
@@ -182,35 +179,3 @@ def test_modes_are_those_of_a_difference_quotient_of_a_step(spread, output):
         cosine = abs(np.vdot(shape, expected)) / np.linalg.norm(shape) / np.linalg.norm(expected)
         assert cosine > 1 - 1e-6
     assert len(modes.to_frame(["a [m]", "b [m]"])) == len(poles)
-
-
-MEASURED = {"output": "coordinates", "initial_velocity": partial(LearnedVelocity, hidden=[5])}
-
-
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("learned", [False, True])
-def test_measured_coordinates_start_exactly_and_move_by_their_velocity(seed, learned):
-    """v is the rate of q by the rule of a step, q_{k+1} - q_k = h (v_k + v_{k+1}) / 2."""
-    model = oscillators(seed, 1.0, **(MEASURED if learned else {"output": "coordinates"}))
-    generator = torch.Generator().manual_seed(seed)
-    x0 = torch.randn(5, 4, generator=generator).double()
-    u = torch.randn(5, 7, 2, generator=generator).double()
-    t = STEP * torch.arange(7).double()
-    path = model.predict(x0, t, Signal(t, u))
-    assert torch.equal(path[:, 0], x0)
-    q, v = path.chunk(2, dim=-1)
-    if learned:
-        first = model.initial_velocity(*x0.chunk(2, dim=-1), u[:, 0])
-        assert (first - v[:, 0]).abs().max() > 0.1
-        v = torch.cat([first[:, None], v[:, 1:]], dim=1)
-    assert_near(q.diff(dim=1), STEP * (v[:, :-1] + v[:, 1:]) / 2, 1e-6)
-    memory = model.start(*x0.chunk(2, dim=-1), u[:, 0], x0[:, :0], x0[:, :0])
-    assert_near(model.observe(memory[:, : 2 * N]), x0[:, :2], 1e-6)
-    for k in range(6):
-        memory, q_next, v_next = model.next_state(memory, u[:, k], u[:, k + 1])
-        assert_near(torch.cat([q_next, v_next], dim=-1), path[:, k + 1], 1e-6)
-
-
-def test_measured_coordinates_need_hidden_ones():
-    with pytest.raises(ValueError, match="expected more than the 2 coordinates"):
-        CoupledOscillators(make_statistics(2, 2), oscillators=2, output="coordinates")

@@ -17,7 +17,7 @@ from pinn_dyn.identification.constants import constants_table
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownSystem
 from pinn_dyn.training import LeastSquares, least_squares
-from pinn_dyn.training.constants_fit import Fit, Prior
+from pinn_dyn.training.constants_fit import Fit, Prior, left_out
 from pinn_dyn.training.filtered_motion import filtered_motion
 from tests.support.known import known_model, motion, motions, statistics
 from tests.support.rigid_chains import joint, link, robot
@@ -387,3 +387,22 @@ def test_fewer_residuals_than_constants_are_refused(runs, caplog):
         robot_model("generic"), runs, few, known
     )
     assert f"give 16 residuals for {count} constants" in caplog.text
+
+
+def test_the_fit_without_a_run_is_exact_for_a_linear_model(runs):
+    """Windows know their run by their start, and a linear fit needs no second one."""
+    parts = [draw_windows([run], count=8, steps=2, stride=2, seed=0) for run in runs]
+    blocks = torch.cat([least_squares._runs_of(windows, runs) for windows in parts])
+    generator = torch.Generator().manual_seed(0)
+    slopes = torch.randn(len(blocks), 3, generator=generator, dtype=torch.float64)
+    data = torch.randn(len(blocks), generator=generator, dtype=torch.float64)
+    root = torch.eye(3, dtype=torch.float64)
+
+    def minimum(rows):
+        system, target = torch.cat([slopes[rows], root]), torch.cat([data[rows], torch.zeros(3)])
+        return torch.linalg.lstsq(system, target).solution
+
+    z = minimum(slice(None))
+    parts = [blocks == number for number in range(2)]
+    fits = left_out(z, slopes, slopes @ z - data, parts, root)
+    torch.testing.assert_close(fits, torch.stack([minimum(slice(8, 16)), minimum(slice(0, 8))]))

@@ -10,7 +10,13 @@ from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.figures import ERROR
 from pinn_dyn.evaluation.report.page import details, drawing, paragraph, slider, table
-from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns, unbeaten_baselines, with_unit
+from pinn_dyn.evaluation.tables import (
+    SEEDS_COLUMNS,
+    preferred_run,
+    summary_columns,
+    unbeaten_baselines,
+    with_unit,
+)
 from pinn_dyn.identification.constants import OPEN
 from pinn_dyn.models.modes import Modes
 
@@ -28,6 +34,7 @@ def summary_parts(
         "better than all baselines. All columns are in summary.csv."
     )
     yield table(summary, headers=summary_columns(summary))
+    yield from map(paragraph, preferred_run(summary))
     yield from map(paragraph, unbeaten_baselines(summary))
     if len(by_model) < len(summary):
         yield table(by_model, headers=SEEDS_COLUMNS)

@@ -38,6 +38,7 @@ _MODELS: dict[str, dict[str, Any]] = {
     "NextStateMLP": {"model.activation": "silu", "data.stride": "about 10 ms"},
     "SubspaceEncoder": {"data.steps": 20},
     "CoupledOscillators": {
+        "model.history": 0.0,
         "data.pairs": 10_000,
         "data.steps": "auto",
         "data.stride": "auto",
@@ -50,7 +51,11 @@ _MODELS: dict[str, dict[str, Any]] = {
 _MODELS_ON_LOGS: dict[str, dict[str, Any]] = {
     "HamiltonianNetwork": {"model.state": "qv"},  # a log has no momenta
     "NextStateMLP": {"data.stride": "about 20 ms"},
-    "CoupledOscillators": {"trainer.steps": 1200, "trainer.validations": 8},
+    "CoupledOscillators": {
+        "model.history": 0.3,  # of a simulated motion, what came before is unknown
+        "trainer.steps": 1200,
+        "trainer.validations": 8,
+    },
 }
 _LEAST_SQUARES = {"trainer.steps": 1, "trainer.validations": 1, "trainer.gradient_clip_val": None}
 _LEAST_SQUARES_ON_LOGS = {"data.pairs": "auto"}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import inspect
 import logging
 import signal
+import statistics
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn import evaluation
 from pinn_dyn.atomic_files import save_whole, write_whole
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.evaluation.metrics import validation_error
+from pinn_dyn.evaluation.prediction import predict_trajectories
 from pinn_dyn.evaluation.tables import units
 from pinn_dyn.identification.constants import (
     CONSTANTS,
@@ -31,7 +35,7 @@ from pinn_dyn.identification.constants import (
 from pinn_dyn.identification.rigid_excitation import rigid_excitation
 from pinn_dyn.identification.weak_joints import weak_joints
 from pinn_dyn.log_check.check import residual_figure
-from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack_until
+from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.plots import save
 from pinn_dyn.run.configuration.build import ConfigError, naming
@@ -123,7 +127,8 @@ def fit_constants(
         errors = training.validator(model.eval(), truth)
     metrics = {f"val/{name}": error for name, error in errors.items()}
     metrics["train/loss"] = result.residual**2
-    record = training.record(1, metrics, stage=result.stage)
+    left_out = _left_out_errors(training, result)
+    record = training.record(1, metrics, stage=result.stage, left_out_errors=left_out)
     for name in ("best", "last"):
         _save(name, training, result, record)
     _write_log(training, truth, metrics, callbacks, loggers)
@@ -135,6 +140,24 @@ def fit_constants(
             save(figure, training.folder / RESIDUALS)
     assert isinstance(model, LearnedConstants)
     training.finish(record, partial(weak_joints, model, runs, solver.cutoff, windows.source.labels))
+
+
+def _left_out_errors(training: PreparedTraining, result: Fit) -> list[float]:
+    """Return the mean error on each training run of a fit without it, as in the validation."""
+    if result.left_out is None:
+        return []
+    validator, model, errors = training.validator, copy.deepcopy(training.model), []
+    window, step = validator.window or validator.horizon, validator.step
+    for z, run in zip(result.left_out, training.windows.splits.train, strict=True):
+        if run.duration < window:
+            continue
+        vector_to_parameters(z.float(), model.parameters())
+        prediction = predict_trajectories(model, stack([run]), window=window, step=step)
+        errors.append(float(prediction.error().mean()))
+    if errors:
+        text = "fits without one of %d runs: error on that run %.3g on average, %.3g to %.3g"
+        log.info(text, len(errors), statistics.fmean(errors), min(errors), max(errors))
+    return errors
 
 
 def _fitted(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import math
 import re
@@ -9,13 +10,15 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+import torch
+
 from pinn_dyn import wording
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.log_check.check import verdict
 from pinn_dyn.log_check.input_faults import SATURATES
-from pinn_dyn.mechanics import double_copy
+from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import KnownMechanics
-from pinn_dyn.run.configuration.build import ConfigError, ModelBuilder
+from pinn_dyn.run.configuration.build import ConfigError, ModelBuilder, naming
 from pinn_dyn.systems import RigidChain
 
 log = logging.getLogger(__name__)
@@ -24,8 +27,9 @@ log = logging.getLogger(__name__)
 def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str, Any]]:
     """Return the builder of a model whose joints are the columns of the data, and its new settings.
 
-    Only builders of known mechanics change: ``structure.joints`` and ``driven_joints`` become the
-    joints that the columns name.
+    Of known mechanics, ``structure.joints`` and ``driven_joints`` become the joints that the
+    columns name. Of networks without ``angles``, these become the coordinates that turn, see
+    :func:`turning`.
 
     Raises:
         ConfigError: as :func:`match_structure`.
@@ -36,7 +40,7 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
         return partial(model, known=mechanics), {"known": inner}
     structure, driven = settings.get("structure"), settings.get("driven_joints")
     if not isinstance(structure, RigidChain):
-        return model, {}
+        return _with_angles(model, source)
     matched = match_structure(structure, source)
     if settings.get("start", "prior") == "prior":
         _log_bodies(matched)
@@ -53,6 +57,37 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
         changes["driven_joints"] = driven = inputs
     settings = {"structure": matched} | ({} if driven is None else {"driven_joints": driven})
     return partial(model, **settings), changes
+
+
+def _with_angles(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str, Any]]:
+    """Set the angles of a network that has none, if coordinates of its data turn."""
+    takes_angles = callable(model) and "angles" in inspect.signature(model).parameters
+    if (
+        isinstance(model, Predictor)
+        or not takes_angles
+        or "angles" in getattr(model, "keywords", {})
+    ):
+        return model, {}
+    with naming("data"):
+        angles = turning(source)
+    if not angles:
+        return model, {}
+    names = ", ".join(source.labels[k] for k in angles)
+    log.info("model.angles=%s: %s turns by more than a revolution", angles, names)
+    return partial(model, angles=angles), {"angles": angles}
+
+
+def turning(source: DataSource) -> list[int]:
+    """Return the coordinates of a log in rad that pass the same direction twice.
+
+    A network of the number of turns would have to learn the same mechanics for each of them.
+    """
+    if not isinstance(source, LogSource):
+        return []
+    q = torch.cat([run.q for run in source.load().train])
+    span = (q.amax(0) - q.amin(0)).tolist()
+    units = source.q.units
+    return [k for k, unit in enumerate(units) if unit == "rad" and span[k] > math.tau]
 
 
 def _log_bodies(structure: RigidChain) -> None:
