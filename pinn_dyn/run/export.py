@@ -57,7 +57,8 @@ def export(
         ValueError: on another ending or function, or an MJCF of elastic joints or feed-forward
             forces.
         TypeError: if the format cannot hold the model.
-        RuntimeError: if the file differs from the model, see :func:`~.exports.exported_function.write`.
+        RuntimeError: if the file differs from the model, see
+            :func:`~.exports.exported_function.write`.
     """
     path = Path(path).expanduser()
     if path.suffix in _WRITERS:
