@@ -1,4 +1,4 @@
-"""Control on a mechanical system, true or learned: laws, references, pipeline and closed loop."""
+"""Control of mechanical systems: laws, references, pipeline and closed loop."""
 
 from pinn_dyn.control.adaptive import AdaptiveTracking
 from pinn_dyn.control.closed_loop import ClosedLoopRecord, close_loop

@@ -1,4 +1,4 @@
-"""A tracking law that adapts the last body and the friction of its model."""
+"""A tracking law that adapts the payload and the friction of its model."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters
 
 Part = Literal["payload", "friction", "offset"]
-_STEP = 0.5  # largest change of an adapted constant in a period, relative
-_FACTOR = math.log(5.0)  # largest factor of the friction
+_STEP = 0.5  # largest relative change of an adapted constant in a period
+_FACTOR = math.log(5.0)  # largest change of the friction, logarithmic
 
 
 class AdaptiveTracking(ModelBasedLaw):
-    """The law of Slotine and Li, which adapts constants of a rigid chain while it tracks::
+    """The law of Slotine and Li, which tracks a motion and adapts constants of a rigid chain::
 
         w = v_r + L (q_r - q),   s = w - v
-        u = A^+ (M dw/dt + C(q, v) w + G + f (D w + F(w)) - o + K_D s)         with J, f, o
+        u = A^+ (M dw/dt + C(q, v) w + G + f (D w + F(w)) - o + K_D s)
         dJ/dt = g J S J,   df_i/dt = g f_i^2 (D w + F(w))_i s_i,   do_i/dt = -g b_i^2 s_i
 
-    J is the pseudo-inertia of the body that carries the tip, with everything that it has picked up,
-    f_i a factor of the friction of joint i, and o_i a constant torque besides that of the model.
-    S is symmetric with tr(S X) = s^T Y(X) for all X, where Y(J) is the part of the law linear in J.
+    J is the pseudo-inertia of the body that carries the tip and its payload, f_i a factor of the
+    friction of joint i, and o_i a constant torque in addition to the model. S is the symmetric
+    matrix with tr(S X) = s^T Y(X) for all X, where Y(J) is the part of the law linear in J.
 
     Stability: let the plant have the constants J*, f* and o*, and no other difference. With the
     divergence d(J* || J) = log(det J / det J*) + tr(J^-1 J*) - 4 of positive matrices, and
@@ -41,15 +41,15 @@ class AdaptiveTracking(ModelBasedLaw):
         V = s^T M s / 2 + (d(J* || J) + sum of d(f*_i, f_i) + sum of (o_i - o*_i)^2 / (2 b_i^2)) / g
 
     has the derivative dV/dt <= -s^T K_D s, because dM/dt - 2 C is skew-symmetric and friction grows
-    with v. So s goes to zero, and q to q_r. J stays positive, and f between 1/5 and 5 and o between
-    -b and b: limits to an interval with the true value do not increase V. A measured state with
-    noise lets constants drift that the motion does not determine.
+    with v. Therefore s converges to zero, and q to q_r. J stays positive definite. f is limited to
+    1/5 to 5 and o to -b to b; limits that include the true values do not increase V. Under
+    measurement noise, constants that the motion does not excite drift.
 
-    Held for a period T: J <- B (1 - X/2)^-1 (1 + X/2) B^T with J = B B^T and X = g T B^T S B, which
-    is limited to a norm of 1/2 and keeps J positive.
+    In discrete time with the period T: J <- B (1 - X/2)^-1 (1 + X/2) B^T with J = B B^T and
+    X = g T B^T S B. The norm of X is limited to 1/2, which keeps J positive definite.
 
-    At limits of the input, a torque A (u - u_applied) is missing. Then s - sigma replaces s in the
-    laws of adaptation, with the part sigma of s that the missing torque explains (without C)::
+    At limits of the input, the torque A (u - u_applied) is missing. Then s - sigma replaces s in
+    the laws of adaptation. sigma is the part of s that the missing torque explains (without C)::
 
         M dsigma/dt + K_D sigma = A (u - u_applied)
 
@@ -61,17 +61,18 @@ class AdaptiveTracking(ModelBasedLaw):
         model: a :class:`RigidChain`, or known mechanics on one, in float64.
         position_gain: diagonal of L, 1/s, one number or N.
         velocity_gain: diagonal of K_D, Nms/rad or Ns/m.
-        rate: g, 1/J. The constants follow an error within about M / (g tau^2) of the torque tau.
-        adapt: constants that adapt: ``"payload"``, ``"friction"`` and ``"offset"``.
+        rate: g, 1/J. The constants converge in a time of about M / (g tau^2) after a torque error
+            tau.
+        adapt: adapted constants: ``"payload"``, ``"friction"`` and ``"offset"``.
         offset: b, Nm or N.
         max_condition, solver: as for :class:`ModelBasedLaw`.
 
     Attributes:
-        constants_size: P, the length of the constants: logarithmic changes of J (10 parameters) and
-            f, and o / b.
+        constants_size: number P of constants: logarithmic changes of J (10 parameters) and of f,
+            and o / b.
 
     Raises:
-        TypeError: on a model without a rigid chain.
+        TypeError: if the model has no rigid chain.
     """
 
     needs_period = True
@@ -105,7 +106,7 @@ class AdaptiveTracking(ModelBasedLaw):
         self._parts = torch.func.jacrev(inertial_parameters)(inertia[body].double())
         n = chain.num_coordinates
         sizes = {"payload": 10, "friction": n, "offset": n}
-        self.sizes = [sizes[part] if part in self.adapt else 0 for part in sizes]
+        self.sizes = [size * (part in self.adapt) for part, size in sizes.items()]
         self.constants_size = sum(self.sizes)
         self.memory_size = self.constants_size + model.num_coordinates + model.num_inputs
         super().__init__(
@@ -115,12 +116,12 @@ class AdaptiveTracking(ModelBasedLaw):
     def step(
         self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
     ) -> Step:
-        """Return u ``(*batch, M)``; the memory holds the constants, sigma and u."""
+        """Return u ``(*batch, M)``. The memory holds the constants, sigma and u."""
         sizes = [self.constants_size, self.num_coordinates, self.num_inputs]
-        constants, lag, wanted = memory.split(sizes, dim=-1)
+        constants, lag, last_u = memory.split(sizes, dim=-1)
         tau = self._torque(q, v, reference, constants)
         u, _, report = self._input(q, v, tau, None, applied, constants)
-        missing = self.model.applied_force(q, v, wanted) - self.model.applied_force(q, v, applied)
+        missing = self.model.applied_force(q, v, last_u) - self.model.applied_force(q, v, applied)
         mass = self.model.mass_matrix(q) / self.period
         gain = torch.diag_embed(self.velocity_gain.to(q).expand(q.shape))
         lag = spd_solve(mass + gain, matvec(mass, lag) + missing)
@@ -131,7 +132,7 @@ class AdaptiveTracking(ModelBasedLaw):
         return Step(u, torch.cat([adapted, lag, u], dim=-1), report)
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return the constants of the model, and no torque that is missing."""
+        """Return the memory with the constants of the model and no missing torque."""
         zero = q.new_zeros(*q.shape[:-1], self.constants_size + self.num_coordinates)
         return torch.cat([zero, u], dim=-1)
 
@@ -141,8 +142,8 @@ class AdaptiveTracking(ModelBasedLaw):
     def changes(
         self, q: Tensor, v: Tensor, reference: Motion, memory: Tensor, lag: Tensor
     ) -> Tensor:
-        """Return the rates of change B^T S B, of log f and of o / b, ``(*batch, R)``."""
-        w, rate = self._wanted(q, v, reference)
+        """Return g B^T S B and the rates of change of log f and of o / b, ``(*batch, R)``."""
+        w, rate = self._reference_velocity(q, v, reference)
         error = w - v - lag
         parts = []
         if self.sizes[0]:
@@ -158,10 +159,10 @@ class AdaptiveTracking(ModelBasedLaw):
         return self.rate * torch.cat(parts, dim=-1)
 
     def adapted(self, memory: Tensor, changes: Tensor, period: float) -> Tensor:
-        """Return the memory after a period in s with constant changes."""
+        """Return the constants after a period in s with constant rates ``changes``."""
         body, friction, offset = memory.split(self.sizes, dim=-1)
         first = 16 if self.sizes[0] else 0
-        moved, *others = changes.split([first, *self.sizes[1:]], dim=-1)
+        moved, *rates = changes.split([first, *self.sizes[1:]], dim=-1)
         if first:
             X = period * moved.unflatten(-1, (4, 4))
             X = X / (1 + X.square().sum((-2, -1), keepdim=True).sqrt() / _STEP)
@@ -169,7 +170,7 @@ class AdaptiveTracking(ModelBasedLaw):
             B = self._root(memory)
             inertia = B @ spd_solve((unit - X / 2).unsqueeze(-3), (unit + X / 2).mT) @ B.mT
             body = self._bodies.parameters_of(inertia.unsqueeze(-3)).squeeze(-2)
-        steps = [(period * x).clamp(-_STEP, _STEP) for x in others]
+        steps = [(period * x).clamp(-_STEP, _STEP) for x in rates]
         friction = (friction + steps[0]).clamp(-_FACTOR, _FACTOR)
         return torch.cat([body, friction, (offset + steps[1]).clamp(-1, 1)], dim=-1)
 
@@ -177,7 +178,7 @@ class AdaptiveTracking(ModelBasedLaw):
         return self._torque(q, v, reference, q.new_zeros(self.constants_size)), None
 
     def _torque(self, q: Tensor, v: Tensor, reference: Motion, constants: Tensor) -> Tensor:
-        w, rate = self._wanted(q, v, reference)
+        w, rate = self._reference_velocity(q, v, reference)
         change, factor, offset = self._constants(constants)
         zero = torch.zeros_like(v)
         model = self.model
@@ -189,13 +190,11 @@ class AdaptiveTracking(ModelBasedLaw):
             tau = tau + matvec(self._regressor(q, v, w, rate), change)
         return tau + self.velocity_gain.to(q) * (w - v)
 
-    def _wanted(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
+    def _reference_velocity(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
         """Return w and dw/dt."""
         gain = self.position_gain.to(q)
-        return (
-            reference.v + gain * (reference.q - q),
-            reference.a + gain * (reference.v - v),
-        )
+        w = reference.v + gain * (reference.q - q)
+        return w, reference.a + gain * (reference.v - v)
 
     def _regressor(self, q: Tensor, v: Tensor, w: Tensor, rate: Tensor) -> Tensor:
         """Return Y ``(*batch, N, 10)`` of the adapted body in M dw/dt + C(q, v) w + G."""
@@ -205,7 +204,7 @@ class AdaptiveTracking(ModelBasedLaw):
         return (at_rest + (both - apart) / 4)[..., self._columns]
 
     def _root(self, memory: Tensor) -> Tensor:
-        """Return B with J = B B^T, NaN where rounding has made J indefinite."""
+        """Return B with J = B B^T; NaN where J is indefinite by rounding."""
         factor, failed = torch.linalg.cholesky_ex(self._inertia(memory))
         return torch.where(failed[..., None, None] == 0, factor, torch.nan)
 
@@ -217,7 +216,7 @@ class AdaptiveTracking(ModelBasedLaw):
     def _constants(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the change of the ten parameters, f and o."""
         _, friction, offset = memory.split(self.sizes, dim=-1)
-        one = memory.new_ones(self.chain.num_coordinates)
+        zero = memory.new_zeros(self.chain.num_coordinates)
         change = inertial_parameters(self._inertia(memory) - self._bodies.start()[0])
-        factor = friction.exp() if self.sizes[1] else one
-        return change, factor, self.offset * offset if self.sizes[2] else 0 * one
+        factor = (friction if self.sizes[1] else zero).exp()
+        return change, factor, self.offset * (offset if self.sizes[2] else zero)

@@ -20,7 +20,7 @@ from pinn_dyn.progress import Progress
 
 @dataclass(frozen=True)
 class ClosedLoopRecord:
-    """K runs of a closed loop, sampled at its control instants; NaN after a run was stopped.
+    """K copies of a closed loop, sampled at its control instants; NaN after a copy was stopped.
 
     Attributes:
         t: control instants, ``(T,)``, s.
@@ -28,7 +28,7 @@ class ClosedLoopRecord:
         u: input applied to the plant, ``(K, T, M)``.
         u_wanted: input of the law before limits and delay, ``(K, T, M)``.
         reference: desired motion, ``(K, T, N)`` each.
-        stopped: for each run None, or when and why it was stopped.
+        stopped: for each copy, the reason and time of a stop, or None.
         diagnostics: diagnostics of the controller, ``(K, T)`` each.
     """
 
@@ -51,7 +51,7 @@ STOPS = {
     "unreachable": "no input gives the force of the law, so the last input is held",
     "no_plan": "the solver found no plan for longer than the horizon",
 }
-"""Reasons to stop a copy, by the marks of the status."""
+"""Reasons to stop a copy, by the names of the bits in the status."""
 Q_BOUND = 1e3
 """Largest |q| of a copy that has not diverged, in the units of q."""
 
@@ -71,16 +71,16 @@ def close_loop(
     samples_rate: PositiveFloat | None = None,
     progress: str | None = None,
 ) -> ClosedLoopRecord:
-    """Run a sampled closed loop, K copies at once, with the input held between instants::
+    """Run K copies of a sampled closed loop, with the input held between control instants::
 
         u(t_k), memory = pipeline(q + noise, v + noise, reference(t_k), memory),    t_k = k / rate
 
-    A copy is stopped if its state, measurement or input is not finite, |q| exceeds 1000, or the
-    status of the pipeline is a reason of :data:`STOPS`. The other copies go on. Ctrl-C returns the
-    record up to then.
+    A copy is stopped if its state, measurement or input is not finite, if |q| exceeds 1000, or if
+    the status of the pipeline has a bit of :data:`STOPS`. The other copies continue. Ctrl-C returns
+    the record up to the current instant.
 
     Args:
-        plant: the plant that is controlled.
+        plant: the controlled plant.
         controller: the law, or its :class:`Pipeline`.
         reference: the desired motion.
         q0, v0: initial configurations and velocities, ``(K, N)`` each.
@@ -88,25 +88,25 @@ def close_loop(
         rate: control instants per second, 1/s.
         actuator: limits of the input of a law.
         sensor: noise of the measurement.
-        dead_time: time after which the plant's inputs act, s, with the first input before.
-        samples_rate: samples of the record per second, 1/s, of which the rate is a multiple; None
-            for all instants.
-        progress: name of the task in lines of progress; None logs none.
+        dead_time: delay of the plant's inputs, s. The first input acts during the first delay.
+        samples_rate: samples of the record per second, 1/s; ``rate`` must be a multiple of it. None
+            records all instants.
+        progress: name of the task in lines of progress; None logs no progress.
 
     Raises:
-        ValueError: on sizes that do not agree, a duration that is no multiple of 1 / rate, or a
-            pipeline of another period.
+        ValueError: if sizes do not agree, the duration is no multiple of 1 / rate, or the pipeline
+            has another period.
     """
     q0, v0 = q0.double(), v0.double()
     if isinstance(controller, Stage):
         controller = Pipeline(controller, 1 / rate, actuator=actuator)
     elif actuator is not None:
-        raise ValueError("actuator: a pipeline has its own limits, give them to the pipeline")
+        raise ValueError("actuator: the controller is a pipeline, pass the limits to Pipeline")
     _check(plant, controller, reference, q0, v0, rate)
-    every = 1 if samples_rate is None else max(1, round(rate / samples_rate))
-    run = _Run(controller, reference, q0, _instants(duration, rate), every)
+    stride = 1 if samples_rate is None else max(1, round(rate / samples_rate))
+    run = _Run(controller, reference, q0, _instants(duration, rate), stride)
     waiting = math.ceil(dead_time * rate - 1e-9)
-    share = dead_time * rate - waiting + 1  # of an interval, before the next input acts
+    share = dead_time * rate - waiting + 1  # part of an interval before the next input acts
     queue = deque([controller.first_input.expand(len(q0), -1)] * waiting)
     if sensor is not None:
         sensor.reset()
@@ -120,7 +120,7 @@ def close_loop(
         ):
             plant.start(q0, v0)
             for k in range(len(run.t)):
-                if k > 1:  # the first instants may build code, which would spoil the estimate
+                if k > 1:  # skip the first instants, which may compile code
                     lines.update(k)
                 if not torch.equal(moving, run.running):
                     moving = run.running.clone()
@@ -144,10 +144,12 @@ def close_loop(
 
 
 class _Run:
-    """The state of a run: the copies that still run, the memory of the law, and the record."""
+    """State of a closed loop: copies that still run, memory of the law, and record."""
 
-    def __init__(self, pipeline: Pipeline, reference: Reference, q0: Tensor, t: Tensor, every: int):
-        self._every = every
+    def __init__(
+        self, pipeline: Pipeline, reference: Reference, q0: Tensor, t: Tensor, stride: int
+    ):
+        self._stride = stride
         self.t, self.running = t, torch.ones(len(q0), dtype=torch.bool, device=q0.device)
         self._pipeline, self._reference, self._like = pipeline, reference, q0
         self._memory = q0.new_zeros(len(q0), pipeline.memory_size)
@@ -156,7 +158,7 @@ class _Run:
         self._is_warned = False
 
     def stop(self, mask: Tensor, k: int, reason: str) -> None:
-        """Stop the copies of a mask ``(K,)`` that still run."""
+        """Stop the running copies in a mask ``(K,)``."""
         if mask.any():
             for copy in (mask & self.running).nonzero()[:, 0].tolist():
                 self._stopped[copy] = f"{reason} at t = {float(self.t[k]):.6g} s"
@@ -174,7 +176,10 @@ class _Run:
     def measure(
         self, k: int, before: tuple[Tensor, Tensor], now: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return the measurement, that before for stopped copies; stop copies where it is lost."""
+        """Return the measurement, or the previous one of stopped copies.
+
+        Copies with a measurement that is not finite are stopped.
+        """
         finite = finite_rows(now[0]) & finite_rows(now[1])
         self.stop(~finite, k, "the measurement is not finite")
         running = self.running.unsqueeze(-1)
@@ -182,7 +187,7 @@ class _Run:
         return q, v
 
     def ask(self, k: int, q: Tensor, v: Tensor) -> Tensor:
-        """Return the input at instant k; meaningless for a stopped copy."""
+        """Return the input at instant k; it has no meaning for stopped copies."""
         time = float(self.t[k])
         motions = [motion_of_copies(self._reference, time + x, q) for x in self._pipeline.ahead]
         motion = motions[0]
@@ -198,27 +203,27 @@ class _Run:
             self._is_warned = True
             log.warning(
                 f"t = {time:.4g} s: {int(outside.sum())} of {len(outside)} states are outside the "
-                f"training data, at distances up to {float(report['distance'].max()):.3g} (1: edge "
-                "of the data)"
+                f"training data, at distances up to {float(report['distance'].max()):.3g} (1 is "
+                "the edge of the data)"
             )
         return u
 
     def write(self, name: str, k: int, value: Tensor) -> None:
-        """Record a value ``(K, ...)`` of the copies that run, at each of the recorded instants."""
-        if k % self._every:
+        """Record a value ``(K, ...)`` of the running copies if instant k is recorded."""
+        if k % self._stride:
             return
-        shape = len(self.t[:: self._every]), *value.shape[1:]
+        shape = len(self.t[:: self._stride]), *value.shape[1:]
         if name not in self._columns:
             self._columns[name] = self._like.new_full((len(value), *shape), torch.nan)
-        column = self._columns[name][:, k // self._every]
+        column = self._columns[name][:, k // self._stride]
         if self.running.all():
             column.copy_(value)
         else:
             column[self.running] = value[self.running].to(column)
 
     def record(self, samples: int) -> ClosedLoopRecord:
-        """Return the record of the first instants."""
-        t = self.t[: samples : self._every]
+        """Return the record of the first ``samples`` instants."""
+        t = self.t[: samples : self._stride]
         motions = [motion_of_copies(self._reference, float(x), self._like) for x in t]
         reference = Motion(*(torch.stack(x, 1) for x in zip(*motions, strict=True)))
         columns = {name: x[:, : len(t)] for name, x in self._columns.items()}
@@ -249,8 +254,8 @@ def _check(
     require_finite("v0", v0)
     if abs(pipeline.period * rate - 1) > 1e-6:
         raise ValueError(
-            f"the period of the pipeline is {pipeline.period:g} s, expected {1 / rate:g} s of the "
-            "loop"
+            f"the period of the pipeline is {pipeline.period:g} s, expected {1 / rate:g} s, the "
+            "period of the loop"
         )
 
 
@@ -260,5 +265,5 @@ def finite_rows(x: Tensor) -> Tensor:
 
 
 def motion_of_copies(reference: Reference, time: float, like: Tensor) -> Motion:
-    """Return the reference at one time for each copy: ``(K, N)`` like another tensor."""
+    """Return the reference at a time for all copies, with shape and type of ``like`` ``(K, N)``."""
     return Motion(*(value.to(like).expand_as(like) for value in reference(time)))

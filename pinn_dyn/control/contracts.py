@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.effects import Actuator, Values
+from pinn_dyn.mechanics.arrays import listed
 
 _KINDS = "is_python", "is_long", "predicts"
 _ROUNDING = 1e-6  # relative; numbers of files may be of type float
@@ -35,10 +36,10 @@ class Reference(abc.ABC):
 
 
 class Step(NamedTuple):
-    """Input ``(*batch, M)``, memory for the next call ``(*batch, memory_size)``, and its report.
+    """Result of a stage: input ``(*batch, M)``, memory ``(*batch, memory_size)`` and report.
 
-    The report holds numbers and marks by name, ``(*batch,)`` each. The marks of
-    :data:`~.pipeline.STATUS` are bits of the status, the other entries go into the record.
+    The report holds numbers and true or false marks by name, ``(*batch,)`` each. The marks in
+    :data:`~.pipeline.STATUS` set the bits of the status; all other entries go into the record.
     """
 
     u: Tensor
@@ -46,17 +47,17 @@ class Step(NamedTuple):
     report: Mapping[str, Tensor] = {}
 
 
-def is_applied(wanted: Tensor, applied: Tensor) -> Tensor:
-    """Return true where all inputs are those that a stage wanted, ``(*batch, 1)``, up to rounding.
+def is_applied(u: Tensor, applied: Tensor) -> Tensor:
+    """Return true where the applied input equals the output u of a stage, ``(*batch, 1)``.
 
-    A stage that integrates holds its memory elsewhere, so that it does not wind up at limits.
+    A stage with an integrator holds its memory where they differ, to avoid windup at limits.
     """
-    equal = (applied - wanted).abs() <= _ROUNDING * wanted.abs()
-    return equal.to(wanted).sum(-1, keepdim=True) > wanted.shape[-1] - 0.5
+    equal = (applied - u).abs() <= _ROUNDING * u.abs()
+    return equal.to(u).sum(-1, keepdim=True) > u.shape[-1] - 0.5
 
 
 class Setting(NamedTuple):
-    """Constants of a pipeline: period and longest dead time in s, limits, and the first input."""
+    """Constants of a pipeline: period in s, longest dead time in s, limits and first input."""
 
     period: float
     dead_time: float
@@ -65,22 +66,23 @@ class Setting(NamedTuple):
 
 
 class Stage(abc.ABC):
-    """A control law, or a stage around one: a pure function of the measurement and its memory.
+    """A control law, or a stage around a law: a pure function of the measurement and its memory.
 
-    :class:`~.pipeline.Pipeline` calls it once in a period, in a closed loop and in exported files.
-    The operations of :meth:`step` must not depend on numbers, unless ``is_python``.
+    :class:`~.pipeline.Pipeline` calls a stage once per period, in closed loops and in exported
+    files. The operations in :meth:`step` must not depend on the values of the tensors, unless
+    ``is_python`` is true.
 
     Attributes:
         num_coordinates, num_inputs: N and M.
         memory_size: length of the memory.
         period: time between two calls, s; NaN until :meth:`at`.
-        needs_period: true for a stage with a memory of time.
-        ahead: times from the measurement to the references that a call takes, s.
-        model: the model of the law, or None; its ``dead_time`` is that of its run.
+        needs_period: true for a stage whose memory depends on the period.
+        ahead: times from the measurement to the references of a call, s.
+        model: the model of the law, or None; its ``dead_time`` is the dead time of the pipeline.
         first_input: input before the first call, one number or M.
-        is_python: true for a stage whose operations depend on numbers: it has no code in C.
-        is_long: true for a stage with so much code that closed loops do not compile it.
-        predicts: true for a law that compensates a dead time itself.
+        is_python: true for a stage whose operations depend on values; it has no code in C.
+        is_long: true for a stage whose code is too long to be compiled for a closed loop.
+        predicts: true for a law that compensates the dead time itself.
     """
 
     memory_size = 0
@@ -104,18 +106,18 @@ class Stage(abc.ABC):
         return stage
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor | None:
-        """Return the memory before the first call with the measurement q, v; None for zeros."""
+        """Return the memory before the first call, which measures q and v; None for zeros."""
         return None
 
     def stiffness(self) -> tuple[Tensor, Tensor] | None:
-        """Return K_P in N/m or Nm/rad and K_D, or None for a law without them."""
+        """Return K_P (N/m or Nm/rad) and K_D (Ns/m or Nms/rad), or None if the law has neither."""
         return None
 
     def about(self) -> dict[str, Any]:
-        """Return fields for the information in a file."""
-        gains = {key: getattr(self, key, None) for key in ("position_gain", "velocity_gain")}
-        listed = {key: x.tolist() if isinstance(x, Tensor) else x for key, x in gains.items()}
-        return {"law": type(self).__name__, "observer": None, "guard": None, **listed}
+        """Return entries for the description in an exported file."""
+        gains = ("position_gain", "velocity_gain")
+        values = {name: listed(getattr(self, name, None)) for name in gains}
+        return {"law": type(self).__name__, "observer": None, "guard": None, **values}
 
     @abc.abstractmethod
     def step(
@@ -125,18 +127,18 @@ class Stage(abc.ABC):
 
         Args:
             q, v: measurement, ``(*batch, N)``.
-            reference: desired motion, ``(*batch, N)`` each; ``(*batch, S, N)`` with S times ahead.
+            reference: desired motion, ``(*batch, N)`` each; ``(*batch, S, N)`` for S times ahead.
             applied: input since the previous call, after all limits, ``(*batch, M)``.
             memory: memory of the previous call or of :meth:`start`.
         """
 
 
 class Wrapper(Stage):
-    """A stage around a law, whose memory follows its own.
+    """A stage around a law. Its memory is followed by the memory of the law.
 
     Args:
-        law: the law, also with other stages around it.
-        own_size: length of the memory of this stage.
+        law: the law, which may have stages around it.
+        own_size: length of the memory of this stage, without that of the law.
     """
 
     def __init__(self, law: Stage, own_size: int = 0):
@@ -160,12 +162,13 @@ class Wrapper(Stage):
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor | None:
         memory = self.law.start(q, v, u)
-        own = q.new_zeros(*q.shape[:-1], self.own_size)
-        return memory if memory is None else torch.cat([own, memory], dim=-1)
+        if memory is None:
+            return None
+        return torch.cat([q.new_zeros(*q.shape[:-1], self.own_size), memory], dim=-1)
 
 
 class Plant(abc.ABC):
-    """K copies of a robot with N coordinates and M inputs, started and moved together."""
+    """K copies of a robot with N coordinates and M inputs that start and move together."""
 
     num_coordinates: int
     num_inputs: int
@@ -176,7 +179,7 @@ class Plant(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        """Hold the input u ``(K, M)`` for a time in s; return q and v after it, ``(K, N)`` each.
+        """Hold the input u ``(K, M)`` for a time in s; return q and v at its end, ``(K, N)`` each.
 
-        A copy that diverges becomes NaN and stays so, and does not affect the other copies.
+        The state of a copy that diverges becomes and stays NaN. Other copies are not affected.
         """

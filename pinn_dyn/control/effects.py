@@ -21,14 +21,14 @@ class Actuator:
 
         low <= u <= high,    |u(t_k) - u(t_k-1)| <= rate (t_k - t_k-1)
 
-    If the rate cannot reach the range, the range wins.
+    If both limits cannot hold, the input obeys ``low`` and ``high``.
 
     Args:
         low, high: limits in the units of u, one number or M; None for no limit.
-        rate: largest rate of change in the units of u per s, likewise.
+        rate: largest rate of change in the units of u per s, one number or M; None for no limit.
 
     Raises:
-        ValueError: if low exceeds high, or is NaN.
+        ValueError: if low exceeds high, or a limit is NaN.
     """
 
     low: Values | None = None
@@ -41,9 +41,9 @@ class Actuator:
             raise ValueError(f"Actuator: low {self.low} and high {self.high}, expected low <= high")
 
     def limit(self, u: Tensor, previous: Tensor | None = None, period: float = 0.0) -> Tensor:
-        """Limit u ``(*batch, M)``, a period after the input ``previous``; NaN stays NaN.
+        """Limit u ``(*batch, M)``, which follows ``previous`` after a period in s; NaN stays NaN.
 
-        The rate is not limited without ``previous``.
+        Without ``previous``, the rate is not limited.
         """
         if self.rate is not None and previous is not None:
             change = period * _like(self.rate, u)
@@ -59,8 +59,8 @@ class Sensor:
 
     Args:
         q_noise: standard deviation of the noise on q, one number or N, in the units of q.
-        v_noise: standard deviation of the noise on v, likewise.
-        seed: seed of the noise, which repeats after a reset.
+        v_noise: standard deviation of the noise on v, one number or N, in the units of v.
+        seed: seed of the noise; a reset repeats the noise.
     """
 
     q_noise: _Deviation = 0.0
@@ -71,7 +71,7 @@ class Sensor:
         self.reset()
 
     def reset(self) -> None:
-        """Start the noise from its seed again."""
+        """Restart the noise from its seed."""
         self._generator = torch.Generator().manual_seed(self.seed)
 
     def __call__(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,8 @@
-"""Files of control laws for other programs."""
+"""Export control laws to files for other programs."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,25 +41,27 @@ def export_law(
     """Write a law to a ``.c`` (with ``.h``), ``.onnx`` or ``.casadi`` file, see docs/realtime.md.
 
     The file holds the :class:`~.pipeline.Pipeline` of the law, the same function as in a closed
-    loop: all stages, the dead time of the run of the model, the limits, and explicit memory.
+    loop: all stages, the dead time of the model's run, the limits, and the memory as an argument.
 
     Args:
-        law: a law of a model in float64 on the CPU, also with stages around it, or its pipeline.
+        law: a law of a model in float64 on the CPU, with or without stages around it, or a
+            pipeline.
         path: the file.
         actuator: limits of the input of a law.
-        period: time between two calls of a law, s; limits of the rate, a dead time and stages with
-            a memory need it.
+        period: time between two calls of a law, s; required for limits of the rate, a dead time,
+            and stages with a memory.
         real: type of the numbers of a ``.c`` or ``.onnx`` file.
-        run: run with the dead time and the names of a law on ``run.model``; a law on
-            ``run.system`` remembers them.
-        about: fields for the information in the file.
-        ranges: smallest and largest q, v and a of the states of the comparison, by name.
+        run: run that gives the dead time and the names for a law on ``run.model``. A law on
+            ``run.system`` needs no run.
+        about: entries for the description in the file.
+        ranges: smallest and largest q, v and a, by name, of the states at which the file is
+            compared with the law.
 
     Raises:
-        ValueError: on another ending, or a missing period.
-        TypeError: on a law that runs in Python only, or an operation that the format does not have.
-        RuntimeError: if the file cannot be compiled or loaded, or does not repeat the law to 1e-9
-            (float: 1e-4).
+        ValueError: if the ending is unknown or the period is missing.
+        TypeError: if the law runs in Python only, or the format lacks an operation of the law.
+        RuntimeError: if the file cannot be compiled or loaded, or differs from the law by more than
+            1e-9 (float: 1e-4).
     """
     path = Path(path).expanduser()
     if path.suffix not in ENDINGS:
@@ -72,7 +75,7 @@ def export_law(
         pipeline = Pipeline(law, period, actuator=actuator, dead_time=dead_time)
     if pipeline.law.is_python:
         inner: Any = pipeline.law
-        while hasattr(inner, "law"):  # of an observer or a guard
+        while hasattr(inner, "law"):  # inside an observer or a guard
             inner = inner.law
         raise TypeError(
             f"{type(inner).__name__} runs in Python and cannot be exported, expected a law "
@@ -81,16 +84,17 @@ def export_law(
     n = pipeline.num_coordinates
     inputs = drawn_states({**dict.fromkeys(INPUTS, n), "memory_in": pipeline.memory_size}, ranges)
     model, limits = pipeline.law.model, pipeline.actuator
+    if not names and model.labels:
+        names = {"q": [*model.labels], "u": [*model.input_labels]}
     info = {
         **pipeline.law.about(),
         "limits": {key: getattr(limits, key) for key in ("low", "high", "rate")},
-        "period": None if pipeline.period != pipeline.period else pipeline.period,
+        "period": None if math.isnan(pipeline.period) else pipeline.period,
         "dead_time": pipeline.dead_time,
         "reference_ahead": pipeline.ahead[0],
         "num_coordinates": n,
         "num_inputs": pipeline.num_inputs,
         "memory_size": pipeline.memory_size,
-        **({"q": [*model.labels], "u": [*model.input_labels]} if model.labels else {}),
         **names,
         **(about or {}),
     }
@@ -113,30 +117,32 @@ def external_torque_function(
 ) -> ExportedFunction:
     """Return ``external_torque(q, v, u, bandwidth, h, memory_in)`` -> tau_ext, memory_out.
 
-    It is one call of :class:`~.observer.MomentumObserver`, h seconds after the previous call, with
-    the measured state and the input that acts at the same instant.
+    The function is one call of :class:`~.observer.MomentumObserver`, h seconds after the previous
+    call, with the measured state and the input that acts at the same instant.
 
     Args:
         model: the model, in float64.
-        ranges: of q, v, u, bandwidth and h for the comparison; 20 to 100 1/s and 0.5 to 1.5 ms.
+        ranges: smallest and largest q, v, u, bandwidth and h at which the exported function is
+            compared with Python. The defaults are 20 to 100 1/s and 0.5 to 1.5 ms.
     """
     n, m = model.num_coordinates, model.num_inputs
-    rest, double = rest_speeds(model), torch.float64
+    speeds, double = rest_speeds(model), torch.float64
 
     def external_torque(q: Tensor, v: Tensor, *values: Tensor) -> tuple[Tensor, Tensor]:
         *inputs, bandwidth, h, memory = values
         u = inputs[0] if inputs else q.new_zeros(0)
-        observer = MomentumObserver(model, bandwidth, rest=rest)
+        observer = MomentumObserver(model, bandwidth, rest=speeds)
         driven = observer.driven(q, v, u)
         residual, memory = observer.estimate(q, v, torch.zeros_like(q), driven, memory, h)
-        before, force, band = memory.tensor_split([1 + 2 * n, 1 + 3 * n])  # the start of the next
+        # The force of this input is also that at the start of the next period.
+        before, force, band = memory.tensor_split([1 + 2 * n, 1 + 3 * n])
         return residual, torch.cat([before, force + driven, band])
 
     usual = {
         "bandwidth": (torch.tensor(20.0, dtype=double), torch.tensor(100.0, dtype=double)),
         "h": (torch.tensor(5e-4, dtype=double), torch.tensor(1.5e-3, dtype=double)),
     }
-    memory_size = MomentumObserver(model, 1.0, rest=rest).memory_size
+    memory_size = MomentumObserver(model, 1.0, rest=speeds).memory_size
     sizes = {"q": n, "v": n, "u": m, "bandwidth": None, "h": None, "memory_in": memory_size}
     states = drawn_states({k: x for k, x in sizes.items() if x != 0}, {**usual, **(ranges or {})})
     about = (

@@ -1,4 +1,4 @@
-"""A helix of the end effector, as a motion of the joints."""
+"""A motion of the joints that moves the end effector along a helix."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _MAX_PATH_ERROR = 1e-5  # m
 
 
 class Helix(Reference):
-    """The tip of an arm runs along a helix, from rest to rest, and then stands still::
+    """Motion of an arm whose tip moves along a helix, from rest to rest, and then stands still::
 
         p(phi) = p_0 + radius ((cos phi - 1) e_1 + sin phi e_2) + pitch phi / (2 pi) e_3
 
-    p_0 is the tip's position in ``posture``, e_3 is the axis, and (e_1, e_2, e_3) are the axes of
-    the base in cyclic order: a helix about z starts along y. The angle phi runs at 2 pi / period,
-    and starts and stops within ``rise_time`` by a quintic.
+    p_0 is the tip position in ``posture``, e_3 is the axis, and (e_1, e_2, e_3) are the axes of
+    the base in cyclic order: a helix about z starts along y. The angle phi grows at 2 pi / period
+    per second. A quintic of length ``rise_time`` starts and stops the motion.
 
     Damped least squares (Wampler 1986) with null-space motion (Liegeois 1977) give the
     configuration nearest to ``posture`` that puts the tip at p(phi); the orientation is free. A
@@ -39,19 +39,20 @@ class Helix(Reference):
     Args:
         arm: the robot.
         posture: configuration at the start, ``(N,)``, rad.
-        radius: m.
+        radius: radius of the helix, m.
         pitch: advance along the axis in one turn, m; 0 is a circle.
         period: duration of one turn at full speed, s.
         turns: number of turns.
         axis: axis of the base along which the helix advances.
-        rise_time: s, at most turns * period; None takes half a period.
+        rise_time: duration of the start and of the stop, s, at most turns * period; None for half a
+            period.
 
     Attributes:
         duration: turns * period + rise_time, s.
-        path_error: largest distance of the tip from the helix, also between knots, m.
+        path_error: largest distance of the tip from the helix, at and between the knots, m.
 
     Raises:
-        ValueError: on a helix that the arm cannot follow, or a longer rise time.
+        ValueError: if the arm cannot follow the helix, or the rise time is too long.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class Helix(Reference):
             )
 
     def path(self, t: float) -> np.ndarray:
-        """Return the desired tip position at time t in s, ``(3,)``, m, in the frame of the base."""
+        """Return the desired tip position at time t in s, ``(3,)``, m, in the base frame."""
         return self._point(self._angle(t)[0])
 
     def __call__(self, t: float) -> Motion:
@@ -105,7 +106,7 @@ class Helix(Reference):
         return Motion(*(torch.from_numpy(value) for value in motion))
 
     def _angle(self, t: float) -> tuple[float, float, float]:
-        """Return phi in rad and its derivatives: the rate rises by s(x) and falls likewise."""
+        """Return phi in rad and its derivatives. The rate rises by s(x) and falls by 1 - s(x)."""
         if t > 0.5 * self.duration:
             phi, rate, rate2 = self._angle(max(self.duration - t, 0.0))
             return self._end - phi, rate, -rate2

@@ -1,4 +1,4 @@
-"""Control of a robot by a model in latent coordinates, for soft robots that motors drive."""
+"""Control of motor-driven soft robots by a model in latent coordinates."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from pinn_dyn.models import CoupledOscillators
 
 _PROCESS = 1e-3  # standard deviation of unknown inputs, in those of the data
 _BANDWIDTH = 0.2  # smallest bandwidth of q_s times the step of the model
-_NEWTON_STEPS = 2  # per call, to z_d
-_ROUNDING = 1e-9  # of periods
+_NEWTON_STEPS = 2  # Newton steps to z_d per call
+_ROUNDING = 1e-9  # error of a number of periods
 _RANK = 1e-3  # singular values below this share of the largest are zero
 
 
@@ -30,30 +30,30 @@ class LatentLaw(Stage):
         q(u_d) = q_s - d,    z_d = z(u_d),    z_d' = H^-1 F J^+ v_ref,    J = dq/du
         dq_s/dt = v_ref + max(K_I, 0.2/T) (q_ref - q_s),    q_s = q before the first call
 
-    Inputs are constant over a period, f(u, 0). q(u) and z(u) are the equilibrium of the model under
-    a constant input u. F = df/du at u_d and
-    the Hessian H of the potential belong to z_d. Inputs are divided by their standard deviations S
-    in the data. The feedback is collocated: F^T z' does the work of the inputs, and C^+ is positive
-    semi-definite. z and z' are the means of the coming period, which follow from u, so that the
-    linearized model loses energy at u_d = const for all gains and periods.
+    q(u) and z(u) are the equilibrium of the model under a constant input u. The input is held over
+    a period, so its force is f(u, 0), with F = df/du at u_d. H is the Hessian of the potential at
+    z_d. S are the standard deviations of the inputs in the data, by which inputs are divided. The
+    feedback is collocated: F^T z' does the work of the inputs, and C^+ is positive semi-definite.
+    z and z' are means over the coming period as functions of u. The linearized model with constant
+    u_d then loses energy for all gains and periods.
 
     The latent state and a disturbance d of the output follow from the measured q::
 
         x_{k+1} = step(x_k, u_k) + L_x r_k,   d_{k+1} = d_k + L_d r_k,   r = q - q(x) - d
 
-    with the gain L of the stationary Kalman filter of the linearized model at the mean input, where
-    d is a random walk. Since the linearized model is stable by construction, (x, d) is detectable,
-    and the eigenvalues of the error are inside the unit circle (:meth:`observer_poles`). d is the
-    integral action: if the loop comes to rest, q = q_ref - d + d = q_ref, whatever the errors of
-    the model. K_I is the bandwidth of d. The set point q_s is filtered against overshoot, with the
-    step T of the model, and follows smooth references without a lag. d does not wind up while the
-    motors are at their limits, since the model knows u.
+    L is the gain of the stationary Kalman filter of the linearized model at the mean input, with a
+    random walk of d. Since the linearized model is stable by construction, (x, d) is detectable,
+    and the eigenvalues of the estimation error are inside the unit circle
+    (:meth:`observer_poles`). d is the integral action with the bandwidth K_I: if the loop comes to
+    rest, q = q_ref - d + d = q_ref for any model error. The filter of the set point q_s, with the
+    step T of the model, avoids overshoot and follows smooth references without lag. d does not wind
+    up while the motors are at their limits, since the model knows the applied u.
 
-    A call takes one step of Newton's method to u_d, which starts at the first input, and two steps
-    to z_d. With a dead time, the feedback uses the state that the model predicts at its end.
+    A call takes one Newton step to u_d, which starts at the first input, and two steps to z_d. With
+    a dead time, the feedback uses the state that the model predicts at the end of the dead time.
 
-    Assumptions: the robot starts at rest with a known input; the loop is stable, which is not
-    proven under sampling, dead time and errors of the model: simulate it.
+    Assumptions: the robot starts at rest with a known input, and the loop is stable. Stability is
+    not proven under sampling, dead time and model errors: simulate the loop.
 
     Source: Stölzle and Della Santina (2024) for the shaped potential and the collocated damping;
     Pannocchia and Rawlings (2003), "Disturbance models for offset-free model-predictive control".
@@ -62,15 +62,15 @@ class LatentLaw(Stage):
 
     Args:
         model: the model, in float64.
-        position_gain: K_P, a factor of the stiffness against the inputs, without a unit.
+        position_gain: K_P, factor of the model's stiffness as felt at the inputs, without a unit.
         velocity_gain: K_D, s.
         integral_gain: K_I, 1/s.
-        dead_time: time after which an input acts, s; None for that of the pipeline.
-        noise: standard deviation of measured q, in those of the training data.
+        dead_time: delay of the inputs, s; None for that of the pipeline.
+        noise: standard deviation of the noise of q, relative to that of q in the training data.
         first_input: input before the first call, one number or M.
 
     Raises:
-        TypeError: on another model.
+        TypeError: if the model is not :class:`CoupledOscillators`.
     """
 
     needs_period, predicts = True, True
@@ -121,7 +121,7 @@ class LatentLaw(Stage):
         return law
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return x, d, q_s, u_d and z_d at rest with a known input, and the inputs before it."""
+        """Return the memory at rest under the input u: x, d, q_s, u_d, z_d and past inputs."""
         past = (x.repeat(*[1] * (x.ndim - 1), self.model.past_steps) for x in (q, u))
         x = self.model.start(q, v, u, *past)[..., : 2 * len(self.model.bias)]
         z_d = self._first_target.expand(*x.shape[:-1], -1)
@@ -129,7 +129,10 @@ class LatentLaw(Stage):
         return torch.cat([x, d, q, u, z_d, *[u] * self._stored], dim=-1)
 
     def observer_gain(self, period: PositiveFloat) -> tuple[Tensor, Tensor]:
-        """Return L ``(2n + N, N)`` and the matrix of the error of (x, d) for a period in s."""
+        """Return L ``(2n + N, N)`` and the transition matrix of the error of (x, d).
+
+        Both are for a period in s.
+        """
         A, B = self.model.transition(self._center, period / self.model.fixed_step)
         S, N = len(A), self.num_coordinates
         rate = -math.expm1(-self.integral_gain * period)
@@ -147,7 +150,7 @@ class LatentLaw(Stage):
         return L, F - L @ C
 
     def observer_poles(self, period: PositiveFloat) -> np.ndarray:
-        """Return the eigenvalues of the error of the observer over a period in s."""
+        """Return the eigenvalues of the estimation error over a period in s."""
         return np.linalg.eigvals(self.observer_gain(period)[1].numpy())
 
     def step(
@@ -178,10 +181,10 @@ class LatentLaw(Stage):
         return Step(u_d + self._u_std * feedback, memory, {"static_residual": residual})
 
     def _observed(self, q: Tensor, x: Tensor, d: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
-        """Move the estimate by a period with the inputs that acted, after its correction."""
-        whole = self._stored - 1
-        share = self._late / self.period - whole  # of the period, for the older input
-        newer, older = past[..., -1 - whole, :], past[..., -2 - whole, :]
+        """Predict x and d by a period with the applied inputs, and correct them by q."""
+        delay = self._stored - 1  # full periods
+        share = self._late / self.period - delay  # part of the period with the older input
+        newer, older = past[..., -1 - delay, :], past[..., -2 - delay, :]
         moved = self._moved(x, self._flow, newer.lerp(older, share))
         error = (q - self.model.observe(moved) - d) / self._q_std
         of_x, of_d = (error @ self._gain.mT).tensor_split([x.shape[-1]], dim=-1)
@@ -192,7 +195,7 @@ class LatentLaw(Stage):
         return x @ flow[0].mT + force @ flow[1].mT
 
     def _predicted(self, x: Tensor, past: Tensor) -> Tensor:
-        """Return the state at the end of the dead time, under the mean input until then."""
+        """Return the state at the end of the dead time, under the mean of the waiting inputs."""
         if not self._late:
             return x
         waiting = math.ceil(self._late / self.period - _ROUNDING)
@@ -201,19 +204,19 @@ class LatentLaw(Stage):
     def _feedback(
         self, x: Tensor, F: Tensor, compliant: Tensor, z_d: Tensor, rate_d: Tensor, u_d: Tensor
     ) -> Tensor:
-        """Return (u - u_d) / S from the mean state of the coming period, which it changes.
+        """Return (u - u_d) / S from the mean state of the coming period.
 
-        ``compliant`` is H^-1 F.
+        This state depends on u, so a linear equation is solved. ``compliant`` is H^-1 F.
         """
         psi = torch.linalg.pinv(F.mT @ compliant, rtol=_RANK, hermitian=True) @ F.mT
-        # Velocities and the velocity gain are those per step of the model.
+        # Velocities and the velocity gain are per step of the model.
         ratio = self.period / self.model.fixed_step
         z, _ = x.chunk(2, dim=-1)
         rate = (self._moved(x, self._flow, u_d)[..., : z.shape[-1]] - z) / ratio
         position, velocity = self.position_gain, self.velocity_gain / self.model.fixed_step
-        wanted = position * (z_d - z - ratio / 2 * rate)
-        wanted = wanted + velocity * (self.model.fixed_step * rate_d - rate)
+        error = position * (z_d - z - ratio / 2 * rate)
+        error = error + velocity * (self.model.fixed_step * rate_d - rate)
         effect = self._flow[1][: z.shape[-1]] @ F / ratio
         change = (ratio / 2 * position + velocity) * psi @ effect
-        one = torch.eye(self.num_inputs).to(change)
-        return torch.linalg.solve(one + change, matvec(psi, wanted).unsqueeze(-1))[..., 0]
+        identity = torch.eye(self.num_inputs).to(change)
+        return torch.linalg.solve(identity + change, matvec(psi, error).unsqueeze(-1))[..., 0]

@@ -1,4 +1,4 @@
-"""Control laws on the terms of a mechanical system, true or learned."""
+"""Control laws from the terms of a mechanical system, analytic or learned."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Gain = float | Sequence[float] | Tensor
 
 
 class ModelBasedLaw(Stage):
-    """A law u = law(q, v, q_ref, v_ref, a_ref) on the terms of a model.
+    """A law u = law(q, v, q_ref, v_ref, a_ref) from the terms of a model.
 
     The gains are diagonal, and A^+(q) is the pseudo-inverse of the input matrix of the model.
 
@@ -28,32 +28,33 @@ class ModelBasedLaw(Stage):
     - Under-actuated, M < N: A A^+ tau is the orthogonal projection of tau on the range of A.
     - Over-actuated, M > N: A^+ tau is the input of least norm that gives tau.
 
-    Inputs are infinite or NaN where A loses its rank.
+    Inputs are infinite or NaN where A is rank-deficient.
 
     The force f(q, v, u) is not linear in u for tendons with motor positions as inputs, and for
     drives that saturate. The solution u* of f(q, v, u*) = tau then replaces A^+ tau, and the
     Jacobian J = df/du at u* replaces A. :class:`InputSolver` starts from the last input. If there
-    is no u*, the law returns the last input and has the mark ``unreachable``.
-    With a model equal to the plant, the force is tau + J J^T (K_P e + K_D de/dt) up to second order
-    in the feedback. Near a set point, the law is stable as with A A^T if J has full rank. This does
-    not hold far from the set point or with slack tendons.
+    is no u*, the law returns the last input and sets the mark ``unreachable``.
 
-    The report has ``input_condition``, the :func:`condition_number` of A(q) or J, the mark
-    ``singular`` above ``max_condition``, and for a force that is not linear in u
-    ``input_residual``, |f(q, v, u*) - tau| in the units of the force.
+    If the model equals the plant, the force is tau + J J^T (K_P e + K_D de/dt) up to second order
+    in the feedback. Near a set point, the law is then stable if J has full rank, as with A A^T.
+    This does not hold far from the set point or with slack tendons.
+
+    The report has ``input_condition``, the :func:`condition_number` of A(q) or J; ``singular``,
+    true above ``max_condition``; and, if the force is not linear in u, ``input_residual``,
+    |f(q, v, u*) - tau| in the units of the force.
 
     Args:
         model: the mechanical system whose terms the law uses, in float64.
         position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
-        max_condition: largest condition number of A(q), or J, that is no fault.
-        solver: tolerance, steps and limits of u*, for a force that is not linear in u.
+        max_condition: largest allowed condition number of A(q) or J.
+        solver: solver for u*, for a force that is not linear in u.
 
     Attributes:
         position_gain, velocity_gain: diagonals of K_P and K_D, ``(N,)``, float64.
 
     Raises:
-        TypeError: on a model that is no mechanical system.
-        ValueError: on bad gains, or a model with a residual force.
+        TypeError: if the model is not a mechanical system.
+        ValueError: if a gain is not positive, or the model has a residual force or no inputs.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class ModelBasedLaw(Stage):
         self.position_gain = diagonal_gain("position_gain", position_gain, self.num_coordinates)
         self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, self.num_coordinates)
         self.model = model
-        self.is_long = not model.input_affine  # it takes all steps of the solver
+        self.is_long = not model.input_affine  # exported code contains all steps of the solver
         self.max_condition = float(max_condition)
         self.solver = solver or InputSolver()
 
@@ -93,7 +94,7 @@ class ModelBasedLaw(Stage):
     def _forces(
         self, q: Tensor, v: Tensor, reference: Motion
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Return tau and h of u = A^+ tau + A^T h, ``(*batch, N)`` each, or None for zero."""
+        """Return tau and h in u = A^+ tau + A^T h, ``(*batch, N)`` each, or None for zero."""
 
     def _input(
         self,
@@ -121,7 +122,7 @@ class ModelBasedLaw(Stage):
         report = {"input_condition": condition, "singular": ~(condition <= self.max_condition)}
         if solution is not None:
             missing = ~solution.converged
-            held = applied + 0 * solution.residual.unsqueeze(-1)  # NaN for a NaN state
+            held = applied + 0 * solution.residual.unsqueeze(-1)  # a NaN state gives NaN
             u = torch.where(missing.unsqueeze(-1), held, u)
             report = {**report, "input_residual": solution.residual, "unreachable": missing}
         return Step(u, memory, report)
@@ -132,13 +133,13 @@ class ModelBasedLaw(Stage):
 
 
 class ProportionalDerivative(ModelBasedLaw):
-    """PD control without compensation, the feedback part of the paper's laws alone::
+    """PD control without compensation, the feedback part of the paper's laws::
 
         u = A(q)^T (K_P (q_ref - q) + K_D (v_ref - v))
 
-    The law uses A of the model only. For a force that is not linear in u, J at a typical input u_0
-    replaces A, and u_0 is added. Arguments and errors: :class:`ModelBasedLaw`. Units of the gains
-    as for :class:`Regulation`.
+    The law uses only A of the model. For a force that is not linear in u, J at a typical input u_0
+    replaces A, and u_0 is added to u. Arguments and errors: :class:`ModelBasedLaw`. Units of the
+    gains as for :class:`Regulation`.
     """
 
     def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[None, Tensor]:
@@ -152,10 +153,9 @@ class Regulation(ModelBasedLaw):
 
         u = A^+(q) G(q) + A(q)^T (K_P (q_ref - q) + K_D (v_ref - v))
 
-    Stability is shown for M = N, A of full rank and v_ref = 0 (paper, Corollary on perfect
-    learning: the terms may be those of the plant times one common matrix P(q)). Arguments and
-    errors: :class:`ModelBasedLaw`. K_P in N/m or Nm/rad and K_D in Ns/m or Nms/rad where A has no
-    unit.
+    Stability is proven for M = N, A of full rank and v_ref = 0. The terms may be those of the plant
+    times a common matrix P(q) (paper, Corollary on perfect learning). Arguments and errors:
+    :class:`ModelBasedLaw`. If A has no unit, K_P is in N/m or Nm/rad and K_D in Ns/m or Nms/rad.
     """
 
     def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
@@ -163,15 +163,15 @@ class Regulation(ModelBasedLaw):
 
 
 class Tracking(ModelBasedLaw):
-    """Tracking of a desired motion, PD with its feed-forward.
+    """Tracking of a desired motion by PD control with feed-forward.
 
     Paper eq. (controller), PD control with computed feed-forward (Kelly and Salgado 1994)::
 
         u = A^+(q) (M(q_r) a_r + C(q_r, v_r) v_r + D(q_r) v_r + F(v_r) + G(q_r))
             + A(q)^T (K_P (q_r - q) + K_D (v_r - v))
 
-    with the dry friction F of the model and C v = (dM/dt) v - d(v^T M v / 2)/dq. The paper takes C
-    from d2L/(dq dv), which gives (dM/dt) v alone. Arguments and errors: :class:`ModelBasedLaw`.
+    with the dry friction F of the model and C v = (dM/dt) v - d(v^T M v / 2)/dq. The paper computes
+    C from d2L/(dq dv), which gives only (dM/dt) v. Arguments and errors: :class:`ModelBasedLaw`.
     Units of the gains as for :class:`Regulation`.
     """
 
@@ -180,7 +180,7 @@ class Tracking(ModelBasedLaw):
 
 
 class ComputedTorque(ModelBasedLaw):
-    """Computed torque, inverse dynamics control (Spong, Hutchinson, Vidyasagar 2006, ch. 8)::
+    """Computed-torque control (Spong, Hutchinson, Vidyasagar 2006, ch. 8)::
 
         u = A^+(q) (M(q) a + C(q, v) v + G(q) + D(q) v + F(v)),
         a = a_r + K_D (v_r - v) + K_P (q_r - q)
@@ -201,8 +201,8 @@ class ComputedTorque(ModelBasedLaw):
 def condition_number(A: Tensor) -> Tensor:
     """Return |A| |A^+| / r in the Frobenius norm, with r = min(N, M), ``(*batch,)``.
 
-    It is 1 for an orthogonal matrix, between 1/r and 1 of the ratio of singular values, and NaN or
-    infinite where A loses its rank or is not finite.
+    The number is 1 for an orthogonal matrix, and otherwise between 1/r and 1 times the ratio of the
+    extreme singular values. It is infinite or NaN where A is rank-deficient or not finite.
     """
     square = A.mT @ A if A.shape[-1] < A.shape[-2] else A @ A.mT
     size = square.shape[-1]
@@ -229,8 +229,8 @@ class MotorPID(Stage):
         u = u_0 + J^+ (K_P e + K_I integral of e dt - K_D v),    e = q_ref - q
 
     Symbols: J = dq/du ``(N, M)``, the static gain of the model at the first configuration and its
-    typical input u_0, constant for a run. The integral is held while an input is limited. A
-    baseline for :class:`~.latent_law.LatentLaw`.
+    typical input u_0. Both stay constant. The integral is held while an input is limited. The law
+    is a baseline for :class:`~.latent_law.LatentLaw`.
 
     Args:
         model: the mechanical system that gives J and u_0.
@@ -254,7 +254,7 @@ class MotorPID(Stage):
         self.memory_size = sum(self._sizes)
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return an integral of zero, no wanted input, u_0 and J^+."""
+        """Return the memory: a zero integral, no previous u, u_0 and J^+."""
         model = self.model
 
         def force(q: Tensor, u: Tensor) -> Tensor:
@@ -263,16 +263,16 @@ class MotorPID(Stage):
         typical = model.typical_input(q)
         _, (stiffness, slope) = jacobians(force, q, typical)
         inverse = torch.linalg.pinv(-torch.linalg.solve(stiffness, slope), rtol=_RANK)
-        wanted = torch.full_like(u, torch.nan)  # the first call does not integrate
-        return torch.cat([torch.zeros_like(q), wanted, typical, inverse.flatten(-2)], dim=-1)
+        last_u = torch.full_like(u, torch.nan)  # the first call does not integrate
+        return torch.cat([torch.zeros_like(q), last_u, typical, inverse.flatten(-2)], dim=-1)
 
     def step(
         self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
     ) -> Step:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
-        integral, wanted, typical, inverse = memory.split(self._sizes, dim=-1)
+        integral, last_u, typical, inverse = memory.split(self._sizes, dim=-1)
         error = reference.q - q
-        integral = integral + self.period * error * is_applied(wanted, applied)
+        integral = integral + self.period * error * is_applied(last_u, applied)
         position, velocity, rate = self.gains
         feedback = position * error + rate * integral - velocity * v
         matrix = inverse.unflatten(-1, (self.num_inputs, self.num_coordinates))

@@ -1,4 +1,4 @@
-"""A disturbance observer that measures and compensates the error of a model-based law."""
+"""A disturbance observer that estimates and compensates the model error of a law."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ _CHUNK = 4096  # samples whose terms are computed at once
 
 
 class MomentumObserver:
-    """The generalized-momentum observer of the force d that the terms of a model do not explain::
+    """Generalized-momentum observer of the force d that a model does not explain::
 
         dp/dt = f(q, v) + A(q) u + d,   p = M(q) v,   f = d(v^T M v / 2)/dq - G - D v - F(v)
         r(t) = K_O (p(t) - p(0) - integral from 0 to t of (f + A u + r) ds)
 
-    so dr/dt = K_O (d - r): r is d through a first-order low-pass. Over a period T::
+    so dr/dt = K_O (d - r): r is the low-pass filtered d. In discrete time with the period T::
 
         r_k+1 = r_k + limited((1 - exp(-K_O T)) (d_k - r_k)),   r_0 = 0
         d_k = (p_k+1 - p_k) / T - (f_k + f_k+1 + A_k u_k + A_k+1 u_k+1) / 2
 
     where each entry is limited to max_rate T. The force of the inputs need not be linear in u.
 
-    With ``rest``, the law is that of sticking rollouts, see
-    :class:`~pinn_dyn.mechanics.sliding.Sliding`: dry friction is sliding friction, and anything
-    between both directions for joints slower than ``rest`` or that reverse. In d_k, it is the value
-    in this range that brings r_k+1 closest to zero.
+    With ``rest``, dry friction is that of rollouts with sticking friction, see
+    :class:`~pinn_dyn.mechanics.sliding.Sliding`. A moving joint has its sliding friction. The
+    friction of a joint that reverses, or is slower than ``rest``, lies between the sliding friction
+    of both directions; d_k uses the value in this range that brings r_k+1 closest to zero.
 
     Source: De Luca and Mattone 2005, Sensorless robot collision detection and hybrid force/motion
     control; Haddadin, De Luca, Albu-Schaeffer 2017, Robot collisions: a survey. Not in the paper.
@@ -42,7 +42,8 @@ class MomentumObserver:
         model: the model.
         bandwidth: K_O, 1/s.
         max_rate: largest rate of change of each entry of r, N/s or Nm/s; None for no limit.
-        rest: speed below which a joint counts as at rest, ``(N,)``, rad/s or m/s; None for none.
+        rest: speeds below which joints count as at rest, ``(N,)``, rad/s or m/s; None for a model
+            without sticking friction.
 
     Attributes:
         memory_size: length of the memory of :meth:`estimate`.
@@ -69,12 +70,12 @@ class MomentumObserver:
         memory: Tensor,
         period: float | Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return r and the memory for the next call, without side effects.
+        """Return r and the memory for the next call.
 
         Args:
             q, v: state, ``(*batch, N)``.
             begin, end: force of the inputs at the start and the end of the period, ``(*batch, N)``.
-            memory: zero before the first call; then 1, r, M v, f and the bounds of dry friction.
+            memory: zero before the first call; later 1, r, M v, f and the bounds of dry friction.
             period: T, s.
         """
         n = q.shape[-1]
@@ -86,8 +87,8 @@ class MomentumObserver:
         band = self._friction_band(v)
         change = self._change(disturbance, residual, period, *_joined(band, last_band))
         residual = residual + torch.where(started > 0.5, change, 0.0)
-        one = torch.ones_like(started)
-        return residual, torch.cat([one, residual, momentum, force, *band], dim=-1)
+        parts = [torch.ones_like(started), residual, momentum, force, *band]
+        return residual, torch.cat(parts, dim=-1)
 
     def observe(
         self, q: Tensor, v: Tensor, u: Tensor, period: float, *, hold: bool = False
@@ -98,14 +99,15 @@ class MomentumObserver:
             q, v: states at the times k T, ``(T, N)``.
             u: inputs at these times, ``(T, M)``.
             period: T, s.
-            hold: true for inputs that are held until the next sample, instead of lines between.
+            hold: true if inputs are held until the next sample, false if they are interpolated.
         """
         before = torch.cat([u[:1], u[:-1]]) if hold else u
-        rows = zip(*(x.split(_CHUNK) for x in (q, v)), strict=True)
-        parts = [self._momentum_and_force(*row) for row in rows]
+        chunks = zip(q.split(_CHUNK), v.split(_CHUNK), strict=True)
+        parts = [self._momentum_and_force(*chunk) for chunk in chunks]
         momentum, force = (torch.cat(x) for x in zip(*parts, strict=True))
-        ending, starting = (force + self.driven(q, v, x) for x in (before, u))
-        disturbance = momentum.diff(dim=0) / period - 0.5 * (ending[1:] + starting[:-1])
+        begin = force + self.driven(q, v, u)
+        end = force + self.driven(q, v, before)
+        disturbance = momentum.diff(dim=0) / period - 0.5 * (begin[:-1] + end[1:])
         band = self._friction_band(v)
         ranges = _joined([x[1:] for x in band], [x[:-1] for x in band])
         residuals = [torch.zeros_like(q[0])]
@@ -115,15 +117,17 @@ class MomentumObserver:
         return torch.stack(residuals)
 
     def _momentum_and_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Return p = M v and f, the part of dp/dt without the input: C^T v - G - D v - F.
+        """Return p = M v and the part f of dp/dt without the input: C^T v - G - D v - F.
 
-        With ``rest``, f is without the dry friction F.
+        With ``rest``, f does not include the dry friction F.
         """
         momentum = self.model.momentum(q, v)
         state = torch.cat([q, momentum], dim=-1)
         no_input = q.new_zeros(*q.shape[:-1], self.model.num_inputs)
         force = self.model.momentum_derivative(state, no_input)[..., q.shape[-1] :]
-        return momentum, force if self.rest is None else force + self.model.friction_force(v)
+        if self.rest is not None:
+            force = force + self.model.friction_force(v)
+        return momentum, force
 
     def driven(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force that the input adds, ``(*batch, N)``."""
@@ -131,7 +135,7 @@ class MomentumObserver:
         return self.model.applied_force(q, v, u) - no_input
 
     def _friction_band(self, v: Tensor) -> list[Tensor]:
-        """Return the least and the largest dry friction at v, ``(*batch, N)``; [] without rest."""
+        """Return the smallest and largest dry friction at v, ``(*batch, N)``; [] without rest."""
         if self.rest is None:
             return []
         forward, resting = (v > 0).to(v), v.abs() < self.rest
@@ -141,31 +145,32 @@ class MomentumObserver:
     def _change(
         self, disturbance: Tensor, residual: Tensor, period: float | Tensor, *friction: Tensor
     ) -> Tensor:
-        """Return r_k+1 - r_k, with the least and largest friction that d does not contain yet."""
+        """Return r_k+1 - r_k for d_k without dry friction, and the bounds of dry friction."""
         exponent = -self.bandwidth * period
         gain = -(exponent.expm1() if isinstance(exponent, Tensor) else math.expm1(exponent))
         if friction:
-            holding = residual - residual / gain - disturbance  # r_k+1 would be zero
-            disturbance = disturbance + torch.clamp(holding, *friction)
+            balance = residual - residual / gain - disturbance  # friction for which r_k+1 = 0
+            disturbance = disturbance + torch.clamp(balance, *friction)
         change = gain * (disturbance - residual)
         limit: Any = self.max_rate * period
         return change.clamp(-limit, limit) if math.isfinite(self.max_rate) else change
 
 
 class DisturbanceObserver(Wrapper):
-    """A law with a :class:`MomentumObserver` that corrects the law's model::
+    """A law corrected by a :class:`MomentumObserver`::
 
         u = u_law - A^+(q) r
 
-    The disturbance is the force that the model's terms do not explain: errors of M, G, D, F and A,
-    a payload, a contact. The observer takes the input that was applied, so that limits of the
-    actuator do not count as a disturbance.
+    The disturbance is the force that the model does not explain: errors of M, G, D, F and A, a
+    payload, a contact. The observer uses the applied input; limits of the actuator therefore do
+    not count as a disturbance.
 
     Stability for a square A: with a = 1 - exp(-K_O T) and mu the largest eigenvalue of M_L M^-1
     (model M_L, plant M), the loop is stable for a mu < 2. An unknown dead time of n periods reduces
-    this for M_L = M to a < 2 sin(pi / (4 n + 2)). Beyond, r alternates within max_rate T.
+    this for M_L = M to a < 2 sin(pi / (4 n + 2)). In an unstable loop, r alternates within
+    max_rate T.
 
-    Assumptions: d changes little within 1 / K_O, u reaches the plant at once, and A has full rank.
+    Assumptions: d changes little within 1 / K_O, u acts without a dead time, and A has full rank.
 
     The report has ``compensation``, |A^+ r| in the units of u.
 
@@ -175,8 +180,8 @@ class DisturbanceObserver(Wrapper):
         max_rate: largest rate of change of each entry of r, N/s or Nm/s; None for no limit.
 
     Raises:
-        TypeError: on a law without a mechanical system.
-        ValueError: on a law of a model whose force is not linear in the input.
+        TypeError: if the law has no mechanical system.
+        ValueError: if the force of the model is not linear in the input.
     """
 
     def __init__(
@@ -188,12 +193,16 @@ class DisturbanceObserver(Wrapper):
     ):
         model = law.model
         if not isinstance(model, MechanicalSystem):
+            kind = "none" if model is None else f"a {type(model).__name__}"
             raise TypeError(
                 f"the observer needs a model with terms M, G and A, and {type(law).__name__} has "
-                f"{'none' if model is None else 'a ' + type(model).__name__}: remove the observer"
+                f"{kind}: remove the observer"
             )
         if not model.input_affine:
-            raise ValueError("the observer needs a force A(q) u: remove controllers.<law>.observer")
+            raise ValueError(
+                "the observer needs a force A(q) u, but the force of this model is not linear in "
+                "u: remove controllers.<law>.observer"
+            )
         self.observer = MomentumObserver(model, bandwidth, max_rate=max_rate)
         n, m = model.num_coordinates, model.num_inputs
         self._sizes = [self.observer.memory_size, n * m, m]
@@ -205,30 +214,30 @@ class DisturbanceObserver(Wrapper):
     def step(
         self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
     ) -> Step:
-        own, last, change, inner = memory.split([*self._sizes, self.law.memory_size], dim=-1)
+        observed, last, change, inner = memory.split([*self._sizes, self.law.memory_size], dim=-1)
         u, after, report = Step(*self.law.step(q, v, reference, applied + change, inner))
         A = self.model.input_matrix(q)
-        last = last.unflatten(-1, A.shape[-2:])
-        begin, end = (matvec(x, applied) for x in (last, A))
-        residual, own = self.observer.estimate(q, v, begin, end, own, self.period)
+        begin = matvec(last.unflatten(-1, A.shape[-2:]), applied)
+        end = matvec(A, applied)
+        residual, observed = self.observer.estimate(q, v, begin, end, observed, self.period)
         compensation = pseudo_inverse_times(A, residual)
         size = compensation.square().sum(-1).sqrt()
         A = A.flatten(-2).expand(*q.shape[:-1], -1)
-        memory = torch.cat([own, A, compensation, after], dim=-1)
+        memory = torch.cat([observed, A, compensation, after], dim=-1)
         return Step(u - compensation, memory, {**report, "compensation": size})
 
 
 def _joined(band: list[Tensor], last_band: list[Tensor]) -> tuple[Tensor, ...]:
-    """Return the least and the largest friction between two instants; () without bands."""
+    """Return the smallest and largest friction between two instants; () without bands."""
     if not band:
         return ()
     return torch.minimum(band[0], last_band[0]), torch.maximum(band[1], last_band[1])
 
 
 def rest_speeds(model: MechanicalSystem) -> Tensor | None:
-    """Return the speeds ``(N,)`` below which joints of a model with stiction count as at rest.
+    """Return the speeds ``(N,)`` below which joints count as at rest.
 
-    These are the widths of its Coulomb law. None for a model whose joints do not stick.
+    These are the widths of the model's Coulomb law. None for a model whose joints do not stick.
     """
     laws = [x for x in model.modules() if isinstance(x, CoulombFriction) and x.sticking]
     return torch.stack([law.width().detach() for law in laws]).amax(0) if laws else None

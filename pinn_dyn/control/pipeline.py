@@ -1,4 +1,4 @@
-"""All between measurement and motor as one pure function, for closed loops and files."""
+"""All computations from measurement to motor as one pure function, for loops and files."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ STATUS = {
     "unreachable": 16,
     "no_plan": 32,
 }
-"""Bits of the status by the names of marks in the report of a stage."""
+"""Bits of the status, by the names of the marks in the report of a stage."""
 
 
 class Call(NamedTuple):
-    """Result of a pipeline: input, status, memory, and the numbers of its stages by name."""
+    """Result of a pipeline: input, status, memory, and the report of its stages."""
 
     u: Tensor
     status: Tensor
@@ -41,16 +41,16 @@ class Call(NamedTuple):
 
 
 class Pipeline(nn.Module):
-    """The stages between measurement and motor at a fixed period, as one pure function::
+    """The stages from measurement to motor at a fixed period, as one pure function::
 
         u, status, memory_out = pipeline(q, v, q_ref, v_ref, a_ref, memory_in)
 
-    1. Before the first call, where the memory is zero, the last inputs are ``first_input``, and the
-       memories of the stages follow from the measurement.
+    1. In the first call, where the memory is zero, the past inputs are ``first_input``, and the
+       memories of the stages are computed from the measurement.
     2. The model predicts the state at the end of the dead time, see :class:`~.pipeline.DeadTime`.
-    3. The law and the stages around it give u.
-    4. If u is not finite, the last u replaces it. If the memory of the stages is not finite or u
-       was replaced, they keep their memory.
+    3. The law and the stages around it compute u.
+    4. If u is not finite, the last u replaces it. If u was replaced, or the new memory of the
+       stages is not finite, the stages keep their old memory.
     5. The actuator limits u.
 
     The status is the sum of 1 (the actuator changed u), 2 (outside the training data), 4 (not
@@ -58,20 +58,22 @@ class Pipeline(nn.Module):
     for longer than the horizon of predictive control).
 
     Args:
-        law: a law, also with stages around it.
-        period: time between two calls, s; None for a law that does not need it.
+        law: a law, with or without stages around it.
+        period: time between two calls, s; None if no stage needs the period.
         actuator: limits of the input.
-        dead_time: time after which an input acts, s, one or M; None for that of the run of the
-            law's model.
+        dead_time: delay of the inputs, s, one number or M; None for the dead time of the law's
+            model.
         first_input: input before the first call, one number or M; None for that of the law.
 
     Attributes:
-        dead_time: as above, s, a tensor.
-        memory_size: 1, the inputs of the dead time or the last one, and the memory of the stages.
-        ahead: times from the measurement to the references of a call, s; one time for most laws.
+        dead_time: delay of the inputs as a tensor, s.
+        memory_size: length of the memory: 1 for the mark of a started pipeline, the past inputs of
+            the dead time (at least the last input), and the memory of the stages.
+        ahead: times from the measurement to the references of a call, s; a single time for most
+            laws.
 
     Raises:
-        ValueError: if the period is missing, or a dead time without a model that predicts.
+        ValueError: if the period is missing, or there is a dead time and no model to predict it.
     """
 
     def __init__(
@@ -85,12 +87,13 @@ class Pipeline(nn.Module):
     ):
         super().__init__()
         self.actuator = actuator or Actuator()
-        known = getattr(law.model, "dead_time", 0.0)
-        times = torch.as_tensor(known if dead_time is None else dead_time, dtype=torch.float64)
-        self.dead_time, late = times, bool(times.any())
-        if period is None and (law.needs_period or late or self.actuator.rate is not None):
+        if dead_time is None:
+            dead_time = getattr(law.model, "dead_time", 0.0)
+        self.dead_time = times = torch.as_tensor(dead_time, dtype=torch.float64)
+        has_delay = bool(times.any())
+        if period is None and (law.needs_period or has_delay or self.actuator.rate is not None):
             raise ValueError(
-                f"{type(law).__name__} with its limits and dead time needs a fixed period: give a "
+                f"{type(law).__name__} with its limits and dead time needs a fixed period: set a "
                 "rate"
             )
         self.period = float("nan") if period is None else float(period)
@@ -100,7 +103,7 @@ class Pipeline(nn.Module):
         self.law = law.at(setting)
         self.ahead, stored = law.ahead, 1
         self._dead_time: DeadTime | None = None
-        if late and not law.predicts:
+        if has_delay and not law.predicts:
             if law.model is None:
                 raise ValueError(
                     f"{type(law).__name__} has no model that predicts over the dead time"
@@ -124,7 +127,7 @@ class Pipeline(nn.Module):
 
     @torch.no_grad()
     def call(self, q: Tensor, v: Tensor, reference: Motion, memory_in: Tensor) -> Call:
-        """Return the result for a measurement ``(*batch, N)``, with the report of the stages."""
+        """Return the result for a measurement q, v ``(*batch, N)``, with the report."""
         names = ("q", "v", "reference.q", "reference.v", "reference.a")
         for name, value in zip(names, (q, v, *reference), strict=True):
             require_last_dim(name, value, self.num_coordinates, "N")
@@ -139,18 +142,19 @@ class Pipeline(nn.Module):
         if self._dead_time:
             q, v = self._dead_time.predict(q, v, past)
         u, after, report = Step(*self.law.step(q, v, reference, last, memory))
-        is_finite = u.abs().sum(-1, keepdim=True) < torch.inf  # CasADi takes u - u for zero
-        wanted = torch.where(is_finite, u, last)
+        is_finite = u.abs().sum(-1, keepdim=True) < torch.inf  # CasADi simplifies u - u to zero
+        command = torch.where(is_finite, u, last)
         if self.law.memory_size:
             is_valid = is_finite & (after.abs().sum(-1, keepdim=True) < torch.inf)
             memory = torch.where(is_valid, after, memory)
-        limited = self.actuator.limit(wanted, last, self.period)
+        limited = self.actuator.limit(command, last, self.period)
         inputs = torch.cat([past, limited.unsqueeze(-2)], dim=-2)
-        changed = (limited != wanted).to(u).sum(-1)
+        changed = (limited != command).to(u).sum(-1)
         marks = {**report, "limited": changed > 0, "not_finite": ~is_finite[..., 0]}
         status = torch.zeros_like(changed)
         for name, bit in STATUS.items():
-            status = status + bit * marks[name].to(u) if name in marks else status
+            if name in marks:
+                status = status + bit * marks[name].to(u)
         memory = torch.cat([torch.ones_like(started), inputs[..., 1:, :].flatten(-2), memory], -1)
         output = self._dead_time.held_back(inputs) if self._dead_time else limited
         numbers = {name: value.to(u) for name, value in report.items()}
@@ -158,7 +162,7 @@ class Pipeline(nn.Module):
         return Call(output, status, memory, numbers)
 
     def run(self, q: Tensor, v: Tensor, reference: Motion, memory_in: Tensor) -> Call:
-        """Return :meth:`call` for rows ``(K, N)``, in C if that pays off."""
+        """Return :meth:`call` for K rows ``(K, N)``, in C if compiling pays off."""
         if self.law.is_python or self.law.is_long:
             return self.call(q, v, reference, memory_in)
         rows = torch.cat([q, v, *reference, memory_in], dim=-1)
@@ -182,33 +186,33 @@ class Pipeline(nn.Module):
         return torch.cat([x.reshape(*rows.shape[:-1], -1) for x in columns], dim=-1)
 
 
-_ROUNDING = 1e-6  # of periods
+_ROUNDING = 1e-6  # error of a number of periods
 
 
 class DeadTime:
-    """Compensation of inputs that act after a dead time d, by the state that the model predicts::
+    """Compensation of a dead time d of the inputs by the predicted state at its end::
 
         x(t_k + d) = x(t_k) + integral from t_k to t_k + d of f(x, u(s - d)) ds
         u_k = law(x(t_k + d), reference(t_k + d))
 
-    In the predicted state, the plant has no dead time: gains, an observer, a guard and predictive
-    control are those for the plant without it. A disturbance acts for d before the law can react,
-    and shifts the predicted state by d^2 / 2 of the acceleration that it causes.
+    For the predicted state, the plant has no dead time: gains, observer, guard and predictive
+    control are designed for the plant without it. A disturbance acts for the time d before the law
+    can react. If it causes the acceleration a, the predicted state is wrong by a d^2 / 2.
 
-    If inputs have different dead times, d is the longest, and the other inputs are held back by the
-    difference, interpolated between two periods.
+    If the inputs have different dead times, d is the longest. Inputs with a shorter dead time are
+    held back by the difference, interpolated between two periods.
 
     Source: Smith 1957, Closer control of loops with dead time; Manitius and Olbrot 1979, Finite
     spectrum assignment problem for systems with delays.
 
     Args:
         model: the model that predicts, in float64.
-        dead_time: d, s, one or M.
+        dead_time: d, s, one number or M.
         period: time between two calls, s.
 
     Attributes:
         ahead: the longest d, s.
-        size: number n of inputs that wait or act at the end of the dead time.
+        size: number n of past inputs that act during the dead time.
     """
 
     def __init__(self, model: MechanicalSystem, dead_time: ArrayLike, period: float):
@@ -217,12 +221,12 @@ class DeadTime:
         self.ahead = float(times.max())
         self.size = n = math.ceil(self.ahead / period - _ROUNDING)
         self._position = torch.from_numpy(n - (self.ahead - times) / period)
-        # Input k of the last n acts between the ends k and k + 1, from now on.
+        # From now on, past input k acts between the times ends[k] and ends[k + 1].
         ends = np.maximum(self.ahead + period * np.arange(-n, 1), 0.0)
         self._lengths = torch.from_numpy(np.diff(ends))
 
     def predict(self, q: Tensor, v: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
-        """Return q and v after the dead time, from the last n inputs ``(*batch, n, M)``."""
+        """Return q and v at the end of the dead time, from the last n inputs ``(*batch, n, M)``."""
         model = sharing(self.model)
         substeps = model.integrator.substeps
         lengths = (self._lengths / substeps).unsqueeze(-1).expand(*past.shape[:-1], 1)
@@ -237,7 +241,7 @@ class DeadTime:
         return q, v
 
     def held_back(self, inputs: Tensor) -> Tensor:
-        """Return the input to apply ``(*batch, M)``, of the last n and the new one."""
+        """Return the input to apply ``(*batch, M)``, from the last n inputs and the new input."""
         number = torch.arange(inputs.shape[-1])
         before, after = self._position.floor().long(), self._position.ceil().long()
         return inputs[..., before, number].lerp(inputs[..., after, number], self._position - before)

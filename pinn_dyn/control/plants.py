@@ -1,4 +1,4 @@
-"""The plants of a closed loop: a mechanical system by an ODE solver, and a stepped simulator."""
+"""Plants of a closed loop: a mechanical system with an ODE solver, and a simulator."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _SMALLEST_STEP = 1e-6
 
 
 class SystemPlant(Plant):
-    """K copies of a mechanical system, solved between control instants with the input held.
+    """K copies of a mechanical system, integrated with a held input between control instants.
 
     The solver is SciPy's ``RK45`` (Dormand and Prince 1980). All copies share its steps, and each
-    copy keeps the tolerance. A copy that needs steps below a microsecond, or whose input is not
-    finite, becomes NaN and stays so.
+    copy keeps the tolerance. The state of a copy that needs steps below a microsecond, or whose
+    input is not finite, becomes and stays NaN.
 
     Args:
         system: the system that moves.
@@ -50,7 +50,7 @@ class SystemPlant(Plant):
         return q.clone(), v.clone()
 
     def _solve(self, x: Tensor, u: Tensor, duration: float) -> Tensor:
-        """Return the states after a time, ``(k, 2N)``, NaN where the solver cannot follow."""
+        """Return the states after a time in s, ``(k, 2N)``; NaN where the solver fails."""
         size = x.shape[-1]
 
         def rates(rows: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ class SystemPlant(Plant):
             with torch.no_grad():
                 return self._compiled.rows("velocity_derivative", rates, rows).numpy().ravel()
 
-        share = len(x) ** -0.5  # SciPy takes the root mean square over all copies
+        share = len(x) ** -0.5  # SciPy compares the root mean square over all copies
         solver = scipy.integrate.RK45(
             slope,
             0.0,
@@ -87,10 +87,10 @@ class SystemPlant(Plant):
 
 
 class SimulatorPlant(Plant):
-    """K copies of a robot that a simulator such as MuJoCo moves in time steps, in turn.
+    """K copies of a robot in a simulator such as MuJoCo, moved one after the other.
 
     Args:
-        arm: the robot, which applies its damping itself.
+        arm: the robot. Its :meth:`step` applies the damping.
         step: time step of the simulator, s.
     """
 

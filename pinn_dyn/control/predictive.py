@@ -1,4 +1,4 @@
-"""Model predictive control on a mechanical system, true or learned."""
+"""Model predictive control with a mechanical system, analytic or learned."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
 class PredictiveControl(Stage):
     """Model predictive control with limits, through CasADi (``pip install 'pinn_dyn[mpc]'``).
 
-    With a C compiler, the model is compiled first, which takes some seconds.
+    If a C compiler is installed, the model is compiled first. This takes some seconds.
 
     At each instant, the law plans a motion over the horizon by :class:`ShootingProblem`, starting
-    from the previous plan, and applies its first input. The plan follows the reference at the times
-    ``ahead``, or a reference of one time, within limits of the state.
+    from the previous plan, and applies the first input of the plan. The plan follows the reference
+    at the times ``ahead``, or a constant reference, within limits of the state.
 
-    u_ref is A^+ times the inverse dynamics of the reference, within the limits. It is zero for a
-    force that is not linear in the input. If the solver fails, as for a state that is not finite,
-    the law holds the last input.
+    u_ref is A^+ times the inverse dynamics of the reference, within the limits. It is zero if the
+    force is not linear in the input. If the solver fails, for example at a state that is not
+    finite, the law holds the last input.
 
-    The report has ``solve_time`` in s, ``iterations``, ``solver_failed`` and ``missed_deadline``,
-    for a call that takes longer than the period, and the mark ``no_plan`` after failures for longer
-    than the horizon.
+    The report has ``solve_time`` in s, ``iterations``, ``solver_failed``, ``missed_deadline``
+    (true for a call that takes longer than the period) and ``no_plan`` (true if the solver failed
+    for longer than the horizon).
 
     Args:
         model: the mechanical system to plan with, in float64.
@@ -54,16 +54,17 @@ class PredictiveControl(Stage):
         input_weight, rate_weight: R of u - u_ref and S of du/dt, one number or M.
         terminal_weight: P in multiples of Q; None for P of the linear-quadratic regulator at the
             end of the reference.
-        actuator: hard limits of the input and of its rate. Limits of the drives in the model are
-            limits, too.
+        actuator: hard limits of the input and of its rate, in addition to the limits of the drives
+            in the model.
         q_low, q_high, v_max: soft limits of the state, one number or N; None for no limit.
         iterations: quadratic programs per instant; the first instant may take 20 times as many.
-        observer_bandwidth: K_O in 1/s of an observer of the acceleration d that the model does not
-            explain, d_k+1 = d_k + (1 - exp(-K_O T)) (measured - d_k); None for d = 0.
+        observer_bandwidth: bandwidth K_O in 1/s of an observer of the acceleration d that the model
+            does not explain, d_k+1 = d_k + (1 - exp(-K_O T)) (measured - d_k); None for d = 0.
 
     Raises:
-        ImportError: without CasADi.
-        ValueError: on values that do not fit N or M, crossed limits, or a horizon below two steps.
+        ImportError: if CasADi is not installed.
+        ValueError: if values do not match N or M, a lower limit exceeds an upper limit, or the
+            horizon is shorter than two steps.
     """
 
     needs_period, is_python = True, True
@@ -91,10 +92,10 @@ class PredictiveControl(Stage):
         self.model, self.step_size = model, float(step)
         steps = round(horizon / step)
         if steps < 2:
-            raise ValueError(f"horizon is {horizon} s, expected two steps of {step} s or more")
+            raise ValueError(f"horizon is {horizon} s, expected at least two steps of {step} s")
         actuator = actuator or Actuator()
         largest = model.largest_input()
-        most = np.full(m, np.inf) if largest is None else largest.detach().numpy()
+        u_max = np.full(m, np.inf) if largest is None else largest.detach().numpy()
         v_high = _row("v_max", v_max, n, np.inf)
         low, high = _row("q_low", q_low, n, -np.inf), _row("q_high", q_high, n, np.inf)
         if (low > high).any():
@@ -103,8 +104,8 @@ class PredictiveControl(Stage):
         self.limits = Limits(
             np.concatenate([low, -v_high]),
             np.concatenate([high, v_high]),
-            np.maximum(_row("actuator.low", actuator.low, m, -np.inf), -most),
-            np.minimum(_row("actuator.high", actuator.high, m, np.inf), most),
+            np.maximum(_row("actuator.low", actuator.low, m, -np.inf), -u_max),
+            np.minimum(_row("actuator.high", actuator.high, m, np.inf), u_max),
             _row("actuator.rate", actuator.rate, m, np.inf),
         )
         self.weights = Weights(
@@ -117,7 +118,7 @@ class PredictiveControl(Stage):
         self._terminal, self._iterations = terminal_weight, iterations
         self._bandwidth = observer_bandwidth
         self.ahead = tuple(self.step_size * k for k in range(steps + 1))
-        # Called before, x, d, failures in a row, has a plan, and the plan.
+        # Memory: is started, x, d, consecutive failures, has a plan, and the plan (x and u).
         self._sizes = [1, 2 * n, n, 1, 1, 2 * n * steps, m * steps]
         self.memory_size = sum(self._sizes)
         self._references: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -134,27 +135,26 @@ class PredictiveControl(Stage):
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
 
         Raises:
-            ValueError: on a first state beyond its limits, or a reference that is not finite.
+            ValueError: if the first state exceeds its limits, or the reference is not finite.
         """
         begin, batch = time.perf_counter(), q.shape[:-1]
         x, u, rows = (
             y.detach().double().cpu().reshape(-1, y.shape[-1]).numpy()
             for y in (torch.cat([q, v], -1), applied, memory)
         )
-        values = list(zip(*(np.split(rows, np.cumsum(self._sizes)[:-1], axis=1)), strict=True))
+        parts = np.split(rows, np.cumsum(self._sizes)[:-1], axis=1)
         self._require_feasible(x, rows[:, 0] < 0.5)
-        ahead = self._ahead(len(x), reference)
+        x_ref, u_ref, P = self._ahead(len(x), reference)
         shared = (time.perf_counter() - begin) / len(x)
-        with np.errstate(invalid="ignore"):  # of a state that is not finite
-            calls = [
-                self._advance(k, values[k], x[k], u[k], *(y[k] for y in ahead))
-                for k in range(len(x))
-            ]
+        calls = []
+        with np.errstate(invalid="ignore"):  # states that are not finite
+            for k in range(len(x)):
+                values = [part[k] for part in parts]
+                calls.append(self._advance(k, values, x[k], u[k], x_ref[k], u_ref[k], P[k]))
         inputs, memories, reports = zip(*calls, strict=True)
-        report = {
-            key: q.new_tensor([values[key] for values in reports]).reshape(batch)
-            for key in reports[0]
-        }
+        report = {}
+        for key in reports[0]:
+            report[key] = q.new_tensor([values[key] for values in reports]).reshape(batch)
         report["solve_time"] += shared
         report["no_plan"] = report.pop("failures") > self.problem.steps
         result, after = (
@@ -163,13 +163,13 @@ class PredictiveControl(Stage):
         return Step(result, after, report)
 
     def plans(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states ``(*batch, 2N, S)`` and inputs ``(*batch, M, S)`` of the last plans."""
+        """Return states ``(*batch, 2N, S)`` and inputs ``(*batch, M, S)`` of the last plans."""
         x, u = memory.split(self._sizes, dim=-1)[-2:]
         sizes = (-1, self.problem.steps)
         return x.unflatten(-1, sizes), u.unflatten(-1, sizes)
 
     def _require_feasible(self, states: np.ndarray, is_first: np.ndarray) -> None:
-        """Refuse first states from which no plan is feasible."""
+        """Raise an error if no plan is feasible from a first state."""
         limits, n = self.limits, self.num_coordinates
         outside = (states < limits.x_low - 1e-9) | (states > limits.x_high + 1e-9)
         outside &= is_first[:, None]
@@ -182,7 +182,7 @@ class PredictiveControl(Stage):
             )
 
     def _ahead(self, count: int, reference: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return x_ref ``(K, 2N, S)``, u_ref ``(K, M, S)`` and P ``(K, 2N, 2N)`` of the plans."""
+        """Return x_ref ``(K, 2N, S)``, u_ref ``(K, M, S)`` and P ``(K, 2N, 2N)`` for the plans."""
         problem, n = self.problem, self.num_coordinates
         shape = count, problem.steps + 1, n
         motions = [x if x.ndim > 2 else x.unsqueeze(-2) for x in reference]
@@ -192,7 +192,7 @@ class PredictiveControl(Stage):
             _, step, k = missing[0].tolist()
             name = f"{'qva'[k // n]}[{k % n}]"
             raise ValueError(f"the reference of {name} {self.ahead[step]:g} s ahead is not finite")
-        # Beyond a limit, the weight of the goal would exceed that of the limit.
+        # A reference beyond a limit would outweigh the soft limit.
         states = torch.cat([q, v], -1).clip(*map(torch.from_numpy, self.limits[:2]))
         (q, v), x = states.split(n, -1), states.numpy()
         x_ref = x[:, 1:].transpose(0, 2, 1)
@@ -209,7 +209,7 @@ class PredictiveControl(Stage):
         return self._references
 
     def _feedforward(self, q: Tensor, v: Tensor, a: Tensor) -> np.ndarray:
-        """Return u_ref without limits at the reference ``(K, S + 1, N)``, ``(K, S + 1, M)``."""
+        """Return u_ref ``(K, S + 1, M)``, without limits, of a reference ``(K, S + 1, N)``."""
         if not self.model.input_affine:
             return np.zeros((*q.shape[:-1], self.num_inputs))
         with torch.no_grad():
@@ -226,7 +226,7 @@ class PredictiveControl(Stage):
         u_ref: np.ndarray,
         P: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
-        """Plan for a copy; return its input, its memory and its report."""
+        """Plan the motion of copy k; return its input, memory and report."""
         begin, problem, n = time.perf_counter(), self.problem, self.num_coordinates
         (started,), x_last, d, (failures,), (has_plan,), *previous = memory
         if started:
@@ -268,11 +268,11 @@ class PredictiveControl(Stage):
 
     @property
     def _time(self) -> float:
-        """The period, or the step of a plan without one."""
+        """Period of the loop, or the step of the plan if the period is unknown, s."""
         return self.step_size if math.isnan(self.period) else self.period
 
     def _shifted(self, plan: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and inputs of a plan a period later."""
+        """Return the states and inputs of a plan, shifted by a period."""
         steps = self.problem.steps
         shift = np.minimum(np.arange(steps) + round(self._time / self.step_size), steps - 1)
         x, u = (y.reshape(-1, steps)[:, shift] for y in plan)
@@ -290,14 +290,15 @@ class PredictiveControl(Stage):
         return d_next if np.isfinite(d_next).all() else d
 
     def _warn_of_excess(self, k: int, plan: Plan) -> None:
-        """Warn if the first plan cannot keep a limit of the state."""
+        """Warn if the first plan violates a limit of the state."""
         i, step = np.unravel_index(int(plan.excess.argmax()), plan.excess.shape)
         if plan.excess[i, step] > 1e-2 * np.abs(plan.x[i]).max():
             n = self.num_coordinates
+            name = f"q[{i}]" if i < n else f"v[{i - n}]"
             log.warning(
-                f"the first plan of run {k} leaves the limits of "
-                f"{f'q[{i}]' if i < n else f'v[{i - n}]'} by {plan.excess[i, step]:.3g} after "
-                f"{(step + 1) * self.step_size:.3g} s: no input within its limits avoids this"
+                f"the first plan of run {k} leaves the limits of {name} by "
+                f"{plan.excess[i, step]:.3g} after {(step + 1) * self.step_size:.3g} s: no input "
+                "within its limits avoids this"
             )
 
 

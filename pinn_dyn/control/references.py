@@ -26,7 +26,7 @@ class SetPoint(Reference):
         q: ``(N,)``, or ``(K, N)`` for K runs, rad (m for a length).
 
     Raises:
-        ValueError: without q, which a command needs for closed loops only.
+        ValueError: if q is missing.
     """
 
     def __init__(self, q: Configurations | None = None):
@@ -56,10 +56,10 @@ class RandomSetPoints(SetPoint):
 
 
 class PointToPoint(Reference):
-    """A straight move in joint space, from rest to rest by a quintic, then held::
+    """A straight move in joint space from rest to rest by a quintic, followed by a hold::
 
         q_ref(t) = q_start + s(x) (q_end - q_start),  s = 10 x^3 - 15 x^4 + 6 x^5,
-        x = (t - begin) / duration, cut to [0, 1]
+        x = (t - begin) / duration, clipped to [0, 1]
 
     The largest speed is 15/8 |q_end - q_start| / duration.
 
@@ -68,7 +68,7 @@ class PointToPoint(Reference):
     Args:
         q_start, q_end: ``(N,)``, or ``(K, N)`` for K runs, rad.
         duration: duration of the move, s.
-        begin: time at which the move begins, s; q_start is held before.
+        begin: time at which the move begins, s; q_start is held until then.
     """
 
     def __init__(
@@ -97,15 +97,15 @@ class Sines(Reference):
 
         q_ref,i(t) = c_i + w(t) a_i sin(2 pi f_i t + phi_i)
 
-    The weight w rises from 0 to 1 within ``rise_time`` by the quintic of :class:`PointToPoint`, so
-    the motion starts at rest at c; with rise_time = 0, w = 1.
+    The weight w rises from 0 to 1 within ``rise_time`` by the quintic of :class:`PointToPoint`. The
+    motion then starts at rest at c. With rise_time = 0, w = 1.
 
     Args:
         centre: c, ``(N,)``, or ``(K, N)`` for K runs, rad.
         amplitude: a, one number or N, rad.
         frequency: f, one number or N, Hz, at least 0.
         phase: phi, one number or N, rad.
-        rise_time: s.
+        rise_time: duration of the smooth start, s.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ def check_limits(
     duration: float,
     v_max: Vector | None = None,
 ) -> None:
-    """Check that a reference stays within the limits of a robot, at up to 10,000 times.
+    """Check at up to 10,000 times that a reference stays within the limits of a robot.
 
     Args:
         reference: the desired motion.
@@ -154,7 +154,7 @@ def check_limits(
         v_max: limits of the speed, ``(N,)``, rad/s; 0 or None for no limit.
 
     Raises:
-        ValueError: naming the first time outside the limits, with joint, value and limits.
+        ValueError: if the reference leaves the limits. The message names the time and the joint.
     """
     speed = torch.zeros(reference.num_coordinates) if v_max is None else _tensor(v_max)
     speed = torch.where(speed == 0, torch.inf, speed)
@@ -166,7 +166,7 @@ def check_limits(
 
 
 def smooth_step(x: float) -> tuple[float, float, float]:
-    """Return s = 10 x^3 - 15 x^4 + 6 x^5, ds/dx and d^2s/dx^2 with x cut to [0, 1]."""
+    """Return s = 10 x^3 - 15 x^4 + 6 x^5, ds/dx and d^2s/dx^2 with x clipped to [0, 1]."""
     x = min(max(x, 0.0), 1.0)
     return (
         x**3 * (10 - 15 * x + 6 * x**2),

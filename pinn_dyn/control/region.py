@@ -1,4 +1,4 @@
-"""The region that training data cover, and a guard that warns outside this region."""
+"""The region of the training data, and a guard that marks states outside this region."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pinn_dyn.mechanics.arrays import require_last_dim
 
 _COLUMN = 32  # states whose distances are compared side by side, see DataRegion.nearest
 FallBack = Literal["hold", "regulation"]
-"""Input outside the training data: the last input, or PD with gravity compensation."""
+"""Input outside the training data: hold the last input, or PD with gravity compensation."""
 
 
 class DataRegion:
@@ -31,15 +31,16 @@ class DataRegion:
         distance(q, v) = min_i |x - x_i| / r
 
     r is the 99th percentile, over the drawn states, of the distance to the nearest drawn state of
-    another trajectory, so 1 is the edge of the data. A single trajectory is cut into ten.
+    another trajectory. A distance of 1 is therefore the edge of the data. A single trajectory is
+    cut into ten.
 
     Args:
         q, v: configurations and velocities of the training trajectories, ``(T_k, N)`` each.
         angles: indices of the coordinates that are angles of unlimited joints.
-        samples: S, largest number of states that are drawn.
+        samples: largest number S of drawn states.
 
     Raises:
-        ValueError: if the trajectories hold the same states.
+        ValueError: if all trajectories hold the same states.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class DataRegion:
         pairs = zip(q, v, strict=True)
         states = torch.cat([self._features(*pair) for pair in pairs]).cpu().double().numpy()
         spread = states.std(axis=0)
-        if self.angles:  # sine and cosine in one unit, that of the angle where it moves little
+        if self.angles:  # a common unit of sine and cosine, for small motions that of the angle
             sine, cosine = np.split(spread[-2 * len(self.angles) :], 2)
             spread[-2 * len(self.angles) :] = np.tile(np.hypot(sine, cosine), 2)
         self._scale = np.where(spread > 1e-12, spread, 1.0)
@@ -80,7 +81,7 @@ class DataRegion:
             raise ValueError("a region needs two different trajectories: give more data or samples")
 
     def distance(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return the distance from the data, ``(*batch,)``, 1 at the edge; NaN for a NaN state."""
+        """Return the distance from the data, ``(*batch,)``; 1 at the edge, NaN for a NaN state."""
         require_last_dim("q", q, self.num_coordinates, "N")
         require_last_dim("v", v, self.num_coordinates, "N")
         states = self._features(q.double(), v.double()).detach().cpu().numpy() / self._scale
@@ -89,7 +90,7 @@ class DataRegion:
         return torch.as_tensor(np.where(finite, nearest / self.radius, np.nan)).to(q)
 
     def distance_of_state(self, q: np.ndarray, v: np.ndarray) -> float:
-        """Return :meth:`distance` of one state, ``(N,)`` each, as a number and without tensors."""
+        """Return :meth:`distance` of a single state, ``(N,)`` each, as a number, with NumPy."""
         with np.errstate(over="ignore", invalid="ignore"):
             x = np.concatenate([q, v])
             if self.angles:
@@ -99,11 +100,12 @@ class DataRegion:
             # |x - x_i|^2 / 2 without the constant |x|^2 / 2 finds the nearest state.
             offset = self._states[(self._halves - self._states @ x).argmin()] - x
             distance = math.sqrt(offset @ offset) / self.radius
-        is_finite = math.isfinite(distance)
-        return distance if is_finite else float(self.distance(*map(torch.from_numpy, (q, v))))
+        if math.isfinite(distance):
+            return distance
+        return float(self.distance(torch.from_numpy(q), torch.from_numpy(v)))
 
     def nearest(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return the distance ``()`` of a state ``(N,)`` by tensor operations, for exports."""
+        """Return :meth:`distance` ``()`` of a state ``(N,)`` by operations that can be exported."""
         features = self._features(q, v)
         states = np.resize(self._tree.data, (-(-self._tree.n // _COLUMN) * _COLUMN, len(features)))
         offset = (features / torch.from_numpy(self._scale)).unsqueeze(-1) - torch.tensor(states.T)
@@ -118,7 +120,7 @@ class DataRegion:
 
 
 class Guarded(Wrapper):
-    """A law with a guard, which marks states far from the training data as ``outside``.
+    """A law with a guard that marks states far from the training data as ``outside``.
 
     The report has ``distance``, the distance from the training data.
 
@@ -130,7 +132,8 @@ class Guarded(Wrapper):
             :class:`Regulation` by the gains of the law, None for the input of the law.
 
     Raises:
-        ValueError: on ``regulation`` for a law whose gains are no stiffness and damping.
+        ValueError: if ``fallback`` is ``regulation`` and the gains of the law are not stiffness and
+            damping.
     """
 
     def __init__(
@@ -147,8 +150,8 @@ class Guarded(Wrapper):
         if fallback == "regulation":
             if gains is None:
                 raise ValueError(
-                    f"fallback regulation needs gains in Nm/rad, and those of "
-                    f"{type(law).__name__} have other units: use the fallback hold"
+                    f"fallback regulation needs gains in Nm/rad, but the gains of "
+                    f"{type(law).__name__} have other units: use fallback=hold"
                 )
             self._regulation = Regulation(law.model, *gains)
 
@@ -163,8 +166,8 @@ class Guarded(Wrapper):
         distance = self.region.nearest(q, v) if is_traced() else self.region.distance(q, v)
         outside = distance > self.threshold
         if self.fallback is not None:
-            other = applied
+            safe = applied
             if self.fallback == "regulation":
-                other = self._regulation.step(q, v, reference, applied, memory).u
-            u = torch.where(outside.unsqueeze(-1), other, u)
+                safe = self._regulation.step(q, v, reference, applied, memory).u
+            u = torch.where(outside.unsqueeze(-1), safe, u)
         return Step(u, memory, {**report, "distance": distance, "outside": outside})

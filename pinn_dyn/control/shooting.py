@@ -1,4 +1,4 @@
-"""The optimal control problem of predictive control: its transcription and its solver."""
+"""Transcription and solver of the optimal control problem of predictive control."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CONVERGED = 1e-4  # largest change of a number in the last iteration, relative
 
 
 class Weights(NamedTuple):
-    """Factor E ``(rows, 2N)`` of Q = E^T E, diagonals R and S ``(M,)``, and rho of the limits."""
+    """Weights: factor E ``(rows, 2N)`` of Q = E^T E, diagonals of R and S ``(M,)``, and rho."""
 
     state: np.ndarray
     input: np.ndarray
@@ -28,7 +28,7 @@ class Weights(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Soft limits of the state ``(2N,)``, hard limits of the input ``(M,)`` and of its rate."""
+    """Soft limits of the state ``(2N,)``; hard limits of the input and its rate, ``(M,)``."""
 
     x_low: np.ndarray
     x_high: np.ndarray
@@ -38,7 +38,7 @@ class Limits(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A trajectory: states ``(2N, S)`` after each of S steps, and inputs ``(M, S)``.
+    """A plan of S steps: states after each step ``(2N, S)``, and inputs ``(M, S)``.
 
     ``gap`` is the largest error of the equation of motion, relative to the largest change of the
     state in a step. ``excess`` ``(2N, S)`` is the violation of the state limits.
@@ -72,7 +72,8 @@ class ShootingProblem:
         model: the system, in float64.
         step: h, s.
         steps: S.
-        weights, limits: of the problem.
+        weights: weights of the cost.
+        limits: limits of the state and the input.
     """
 
     def __init__(
@@ -145,7 +146,7 @@ class ShootingProblem:
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """Return da/dz, ``(K, N, 2N + M)``, at K states and inputs, by forward differences.
 
-        Forward differences take less time than exact derivatives of networks.
+        For networks, forward differences are faster than exact derivatives.
         """
         moved = z + _DIFFERENCE * np.maximum(1, np.abs(z))
         points = np.where(np.eye(z.shape[-1], dtype=bool), moved[:, None], z[:, None])
@@ -169,8 +170,8 @@ class ShootingProblem:
             return scipy.linalg.solve_discrete_are(A, B, Q, R)
         except np.linalg.LinAlgError as error:
             raise ValueError(
-                f"no linear law holds the model at q = {x[:n].round(4).tolist()} ({error}): set "
-                "terminal_weight to a number"
+                f"no linear law stabilizes the model at q = {x[:n].round(4).tolist()} ({error}): "
+                "set terminal_weight to a number"
             ) from error
 
     def solve(
@@ -192,13 +193,13 @@ class ShootingProblem:
             x0, u0, d: state ``(2N,)``, previous input ``(M,)``, additional acceleration ``(N,)``.
             x_ref, u_ref: references ``(2N, S)`` and ``(M, S)``.
             P: terminal weight, ``(2N, 2N)``.
-            guess: states and inputs of a plan to start from.
+            guess: states and inputs of the initial plan.
             period: time since u0 was applied, s.
             iterations: largest number of quadratic programs.
 
         Raises:
-            FloatingPointError: on a number that is not finite, or if a quadratic program has no
-                solution.
+            FloatingPointError: if the state or an acceleration is not finite, or a quadratic
+                program has no solution.
         """
         (n, m), steps, limits = self.sizes, self.steps, self.limits
         lows, highs, rated = self._rows
@@ -210,7 +211,8 @@ class ShootingProblem:
         )
         change = np.tile(limits.rate[rated] * self.step, steps)
         change[: len(rated)] = limits.rate[rated] * period
-        x_low, x_high = np.tile(limits.x_low[lows], steps), np.tile(limits.x_high[highs], steps)
+        x_low = np.tile(limits.x_low[lows], steps)
+        x_high = np.tile(limits.x_high[highs], steps)
         motion = np.zeros(2 * n * steps)
         rows_low = np.concatenate([motion, x_low, np.full(x_high.size, -np.inf), -change])
         rows_high = np.concatenate([motion, np.full(x_low.size, np.inf), x_high, change])
@@ -223,7 +225,7 @@ class ShootingProblem:
             return float(np.maximum(rows_low - rows, rows - rows_high).clip(min=0).sum())
 
         def evaluated(w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return the points of the accelerations, the cost, and the rows."""
+            """Return the points z of the accelerations, the cost, and the constraint rows."""
             x, u = w[: free.size].reshape(steps, 2 * n), w[free.size :][: m * steps]
             points = np.hstack([(np.vstack([x0, x[:-1]]) + x) / 2, u.reshape(steps, m)])
             cost, rows = self._values(w, *arguments, self.accelerations(points).T)

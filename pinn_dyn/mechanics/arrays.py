@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def listed(value: Any) -> Any:
-    """Return an array or a tensor as a list or a number, and other values unchanged."""
+    """Convert an array or a tensor to a list or a number. Return other values unchanged."""
     return value.tolist() if isinstance(value, Tensor | np.ndarray | np.generic) else value
 
 
@@ -65,7 +65,7 @@ def jacobians(function: Callable[..., Tensor], *values: Tensor) -> tuple[Tensor,
 def pseudo_inverse_times(A: Tensor, tau: Tensor) -> Tensor:
     """Return A^+ tau, ``(*batch, M)``, for A ``(*batch, N, M)`` and tau ``(*batch, N)``.
 
-    A row of the batch where A lost its rank or is not finite gives infinities or NaN.
+    Rows of the batch where A is rank-deficient or not finite contain infinities or NaN.
     """
     rows, columns = A.shape[-2:]
     transposed = A.transpose(-1, -2)
@@ -82,12 +82,12 @@ def pseudo_inverse_times(A: Tensor, tau: Tensor) -> Tensor:
 
 
 def spd_solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve ``matrix x = vector`` for a symmetric positive definite matrix, or else return NaN."""
+    """Solve ``matrix x = vector``; NaN where the matrix is not symmetric positive definite."""
     return spd_solver(matrix)(vector)
 
 
 def spd_solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
-    """Return :func:`spd_solve` for a fixed matrix, which is factored once."""
+    """Factor a matrix once and return the function :func:`spd_solve` of the vector."""
     factor, failed = torch.linalg.cholesky_ex(matrix)
 
     def solve(vector: Tensor) -> Tensor:

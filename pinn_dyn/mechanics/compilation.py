@@ -29,8 +29,8 @@ step for 54 s at N = 3 and 124 s at N = 7. For ensembles it always pays off."""
 MOST_EVALUATIONS = 4
 """Largest number of evaluations of the dynamics in a window that is compiled as one program."""
 CHUNK = 256
-"""Number of windows with MOST_EVALUATIONS that are computed at once, so that the values for the
-gradient stay in the cache. Batches of less than twice this number are not split."""
+"""Number of windows with MOST_EVALUATIONS evaluations that are computed at once. The values for
+the gradient then stay in the cache. Batches of less than twice this number are not split."""
 LARGEST_PLANNED = 7_000
 """Largest number of operations of a program whose memory is planned, an experimental option of the
 compiler: an RK4 step with gradients has 6,500 at N = 3. The recursion is too deep at N = 7."""
@@ -52,7 +52,7 @@ def integrated_by(model: ContinuousPredictor, integrator: Integrator) -> Iterato
 
 
 class Wrapped(Integrator):
-    """Integrator with the steps of another, for another way to run them."""
+    """Integrator that takes the steps of an inner integrator and may compute paths differently."""
 
     def __init__(self, inner: Integrator):
         super().__init__(inner.substeps)
@@ -66,11 +66,11 @@ class Wrapped(Integrator):
 
 
 class Unrolled(Wrapped):
-    """Integrator whose paths are the traceable loop over single steps."""
+    """Integrator that computes paths by a traceable loop over single steps."""
 
 
 class CompiledDynamics(Wrapped):
-    """Integrator of dynamics whose derivative or step is compiled, with gradients."""
+    """Integrator that compiles the derivative or the step of its dynamics, with gradients."""
 
     def __init__(self, inner: Integrator, dynamics: Dynamics):
         super().__init__(inner)
@@ -88,9 +88,10 @@ class CompiledDynamics(Wrapped):
 def compile_graph(
     function: Callable[..., Any], arguments: tuple[Tensor, ...]
 ) -> Callable[..., Any]:
-    """Compile a function for arguments of fixed shapes and types, by a single trace.
+    """Trace a function once and compile it for arguments of the same shapes and types.
 
-    The program has no checks. On a CPU it runs in one thread; on a GPU it is a CUDA graph.
+    The program does not check its arguments. On a CPU it runs in one thread; on a GPU it is a
+    CUDA graph.
     """
     from torch._inductor import compile as compile_fx_graph  # the import takes a second
 
@@ -103,17 +104,17 @@ def compile_graph(
         # Combined kernels of independent heads need fewer launches.
         program = compile_fx_graph(graph, list(arguments), {"combo_kernels": True})
         return _Recorded(program, arguments)
-    # Without the wrappers of torch.compile, which take 0.15 ms per call.
+    # Avoid the wrappers of torch.compile, which take 0.15 ms per call.
     if len(graph.graph.nodes) <= LARGEST_PLANNED:
         try:
             return compile_fx_graph(copy.deepcopy(graph), list(arguments), _OPTIONS | _PLANNED)
         except Exception as error:
-            log.info("compiling again without an experimental option: %s", type(error).__name__)
+            log.info("memory planning failed (%s): compiling without it", type(error).__name__)
     return compile_fx_graph(graph, list(arguments), _OPTIONS)
 
 
 def _share_constants(graph: GraphModule) -> None:
-    """Replace equal constants by one, so that the compiler evaluates equal features once."""
+    """Merge equal constants. The compiler then evaluates equal features only once."""
     constants: list[tuple[Node, Tensor]] = []
     for node in graph.graph.find_nodes(op="get_attr"):
         value = getattr(graph, node.target)
@@ -162,7 +163,7 @@ def _mm(a: Tensor, b: Tensor) -> Tensor:
     if b.shape[1] == 1 and a.shape[0] > 1:
         # The compiler fuses products with a single row.
         return (b.T @ a.T).T
-    # Not for a single row: the compiler would evaluate its inputs for every column.
+    # Skip a single row: the compiler would evaluate its inputs for every column.
     if a.shape[1] <= _SHORT and b.shape[1] > _SHORT and a.shape[0] > 1:
         total = a[:, :1] * b[:1]
         for k in range(1, a.shape[1]):

@@ -13,12 +13,12 @@ from torch import Tensor
 from pinn_dyn.mechanics.arrays import jacobians, matvec, spd_solve
 
 _SMALLEST, _FIRST = 1e-10, 1e-2  # damping mu, at the start and after the first failed step
-_SMALLER, _LARGER = 0.1, 10.0  # its changes after a step
-_SETTLED = 1e-4  # step relative to u of more inputs than coordinates
+_SMALLER, _LARGER = 0.1, 10.0  # factors of mu after an accepted and a rejected step
+_SETTLED = 1e-4  # largest final step relative to u, if M > N
 
 
 class Solution(NamedTuple):
-    """Input u ``(*batch, M)``, J = dF/du at u, and |F(u) - tau| with its test ``(*batch,)``."""
+    """Input u ``(*batch, M)``, J = dF/du at u, residual |F(u) - tau| and its convergence test."""
 
     u: Tensor
     J: Tensor
@@ -60,22 +60,23 @@ class InputSolver:
         *,
         all_steps: bool = False,
     ) -> Solution:
-        """Solve F(u) = tau ``(*batch, N)``, first from the start with the shorter Newton step.
+        """Solve F(u) = tau ``(*batch, N)`` from the start with the shorter first Newton step.
 
-        Where this does not succeed, solve from the other start.
+        Rows that do not converge are solved again from the second start.
 
         Args:
             force: F, maps ``(*batch, M)`` to ``(*batch, N)`` row by row.
             tau: the force.
-            typical: u_0, ``(*batch, M)``, a start.
-            previous: another start, the input of the previous instant, ``(*batch, M)``.
-            all_steps: take all steps, so that the operations do not depend on the numbers.
+            typical: first start u_0, ``(*batch, M)``.
+            previous: second start, the input of the previous instant, ``(*batch, M)``.
+            all_steps: take all steps; the operations then do not depend on the numbers.
         """
         if previous is None:
             return self._solve(force, tau, typical, typical, all_steps)
         mu = torch.full_like(tau[..., :1], _SMALLEST)
         points = [_linear(force, torch.ones_like(tau), u) for u in (previous, typical)]
-        nearer = torch.lt(*(_norm(_damped_step(x.J, tau - x.F, mu)) for x in points))
+        lengths = [_norm(_damped_step(x.J, tau - x.F, mu)) for x in points]
+        nearer = lengths[0] < lengths[1]
         near, far = previous.where(nearer, typical), typical.where(nearer, previous)
         first = self._solve(force, tau, typical, near, all_steps)
         if not all_steps and bool(first.converged.all()):
@@ -137,7 +138,8 @@ class InputSolver:
     def _clamped(self, u: Tensor) -> Tensor:
         low = -torch.inf if self.low is None else self.low
         high = torch.inf if self.high is None else self.high
-        return u.clamp(*(torch.as_tensor(x, dtype=u.dtype, device=u.device) for x in (low, high)))
+        lowest = torch.as_tensor(low, dtype=u.dtype, device=u.device)
+        return u.clamp(lowest, torch.as_tensor(high, dtype=u.dtype, device=u.device))
 
 
 class _Point(NamedTuple):
@@ -157,9 +159,9 @@ def _chosen(mask: Tensor, first: _Point, second: _Point) -> _Point:
 
 
 def _damped_step(J: Tensor, r: Tensor, mu: Tensor) -> Tensor:
-    """Return W J^T (J W J^T + mu |J W^(1/2)|^2 / N)^-1 r, with W = 1 until mu has grown.
+    """Return W J^T (J W J^T + mu |J W^(1/2)|^2 / N)^-1 r, with W = 1 for small mu.
 
-    For M < N, this is (J^T J + mu |J|^2 / M)^-1 J^T r, which has no singular matrix.
+    For M < N, return (J^T J + mu |J|^2 / M)^-1 J^T r, whose matrix is not singular.
     """
     if J.shape[-1] < J.shape[-2]:
         gram = J.mT @ J

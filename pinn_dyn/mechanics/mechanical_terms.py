@@ -39,7 +39,7 @@ class MechanicalTerms(ContinuousPredictor):
         """Return A(q), ``(*batch, N, M)``."""
 
     def typical_input(self, q: Tensor) -> Tensor:
-        """Return an input ``(*batch, M)`` where the search for an input with a force starts."""
+        """Return a typical input ``(*batch, M)``, the start of an :class:`~.InputSolver`."""
         return q.new_zeros(*q.shape[:-1], self.num_inputs)
 
     def _potential_force(self, q: Tensor) -> Tensor:
@@ -73,15 +73,18 @@ class MechanicalTerms(ContinuousPredictor):
         return torch.zeros_like(v)
 
     def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
-        """Return the friction of coordinates that slide forward in a ``share`` of the time."""
+        """Return the friction of sliding coordinates, ``(*batch, N)``.
+
+        ``share`` (0 to 1) is the part of the time in which a coordinate slides forward.
+        """
         return self.friction_force(v)
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        """Return stiff terms K(q) of dG/dq, ``(*batch, N, N)``, or None, for implicit methods."""
+        """Return the stiff part K(q) of dG/dq for implicit methods, ``(*batch, N, N)``, or None."""
         return None
 
     def largest_input(self) -> Tensor | None:
-        """Return the inputs beyond which the drives give no more force, ``(M,)``, or None."""
+        """Return the inputs at which the force of the drives saturates, ``(M,)``, or None."""
         return None
 
     def input_force(self, q: Tensor, u: Tensor) -> Tensor:
@@ -94,10 +97,12 @@ class MechanicalTerms(ContinuousPredictor):
     def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force of the inputs and the residual force, ``(*batch, N)``."""
         force = self.input_force(q, u)
-        return force + self._residual_force(q, v, u) if self.has_residual else force
+        if self.has_residual:
+            force = force + self._residual_force(q, v, u)
+        return force
 
     def reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
-        """Return the force closest to tau that an input gives, ``(*batch, N)``."""
+        """Return the force closest to tau that the drives can exert, ``(*batch, N)``."""
         return tau
 
     def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,6 +121,6 @@ class MechanicalTerms(ContinuousPredictor):
         return torch.func.grad(lambda x: 0.5 * (v * matvec(self.mass_matrix(x), v)).sum())(q)
 
     def resistance_matrix(self, q: Tensor, step: Tensor) -> Tensor:
-        """Return D + s K, ``(*batch, N, N)``."""
+        """Return D(q) + s K(q), ``(*batch, N, N)``, with the time s = ``step``, ``()``, s."""
         damping, stiffness = self.damping_matrix(q), self.stiffness_matrix(q)
         return damping if stiffness is None else damping + step * stiffness

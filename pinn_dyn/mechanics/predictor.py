@@ -28,10 +28,11 @@ class Predictor(nn.Module, abc.ABC):
         fixed_step: step of a discrete-time model in s, or None if any step is possible.
         penalized: true if training adds :meth:`penalty` to the loss.
         input_history: time before the start in which the model uses the input, s.
-        past_steps: number n of earlier q that the model uses, a step apart, the latest first. x0
-            ``(*batch, 2N + nN)`` holds them after the state; without them the robot was at rest.
+        past_steps: number n of earlier q that the model uses, one step apart, the latest first.
+            They follow the state in x0 ``(*batch, 2N + nN)``. If x0 ends with the state, the robot
+            is assumed to have been at rest.
         labels, input_labels: name and unit of each coordinate and input, for files, if known.
-        dead_time: time after which inputs of the robot act, one or M, s, for control laws.
+        dead_time: delay of the robot's inputs for control laws, one number or M, s.
     """
 
     fixed_step: float | None = None
@@ -99,7 +100,7 @@ class ContinuousPredictor(Predictor):
         """Return dx/dt, ``(*batch, S)``, of the state x ``(*batch, S)`` under u ``(*batch, M)``."""
 
     def velocity_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """Return d(q, v)/dt, ``(*batch, 2N)``, at x = (q, v), also where the state is (q, p)."""
+        """Return d(q, v)/dt, ``(*batch, 2N)``, at x = (q, v), also for models with state (q, p)."""
         return self.state_derivative(x, u)
 
     @final
@@ -112,9 +113,9 @@ class ContinuousPredictor(Predictor):
             [[A_d, B_d], [0, 1]] = expm(T [[A, B], [0, 0]])      with a sample time T: x_k+1, held u
 
         A and B describe deviations from an equilibrium (f = 0) or from a motion. The state is
-        (q, v), m or rad and m/s or rad/s, also of models that integrate (q, p). Inputs are
-        those of the drives; elastic joints have their motors in q. Dry friction enters by its slope
-        at v, which is largest at v = 0.
+        (q, v), m or rad and m/s or rad/s, also for models that integrate (q, p). Inputs are
+        those of the drives; q of elastic joints includes their motors. Dry friction enters by its
+        slope at v, which is largest at v = 0.
 
         Args:
             q, v: ``(*batch, N)``.
@@ -122,7 +123,7 @@ class ContinuousPredictor(Predictor):
             sample_time: T, s; None returns the continuous pair.
 
         Raises:
-            ValueError: on shapes.
+            ValueError: if a shape is wrong.
         """
         require_last_dim("q", q, self.num_coordinates, "N")
         require_last_dim("v", v, self.num_coordinates, "N")
@@ -138,7 +139,7 @@ class ContinuousPredictor(Predictor):
         return held[..., :size], held[..., size:]
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return a function from r to k with (1 - s J) k = r, J the stiff part of df/dx (zero)."""
+        """Return a function from r to k with (1 - s J) k = r. The stiff part J of df/dx is zero."""
         return lambda rate: rate
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ def path_between(
 def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
     """Return the times of the integrator's steps, ``(substeps (T - 1) + 1,)``.
 
-    A step that ends at a sample of the input up to rounding ends at exactly that time, since a held
+    Ends of steps within rounding of an input sample are moved to its exact time, since a held
     input jumps there.
     """
     fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps

@@ -19,7 +19,7 @@ Interpolation = Literal["hold", "linear", "cubic"]
 
 @dataclass(frozen=True)
 class Signal:
-    """An input u(t) that is sampled. Before the first and after the last sample it is constant.
+    """A sampled input u(t), constant before the first and after the last sample.
 
     Between the samples u_k at t_k and u_{k+1} at t_{k+1}, with s = (t - t_k)/h from 0 to 1::
 
@@ -68,12 +68,12 @@ class Signal:
 
     @property
     def num_inputs(self) -> int:
-        """M."""
+        """Number of inputs M."""
         return self.u.shape[-1]
 
     @property
     def batch(self) -> torch.Size:
-        """Batch shape."""
+        """Batch shape of u."""
         return self.u.shape[:-2]
 
     def part(self, samples: slice) -> Signal:
@@ -85,7 +85,7 @@ class Signal:
         return self._changed(self.t - start, lambda value: value)
 
     def delayed(self, delays: Tensor) -> Signal:
-        """Return u_i(t - d_i), for d ``(M,)`` in s. Its samples are at all shifted times."""
+        """Return u_i(t - d_i) for delays d ``(M,)`` in s, sampled at all shifted times."""
         if not len(delays.unique()) > 1:
             return self.since(-delays[:1].sum())
         t = torch.cat([self.t + d for d in delays.unique().to(self.t)]).sort().values
@@ -94,7 +94,7 @@ class Signal:
         return Signal(t, torch.stack(inputs, dim=-1).movedim(0, -2), self.interpolation)
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Signal:
-        """Apply a change of the batch, such as ``lambda u: u[index]``, to samples and rates."""
+        """Apply a function such as ``lambda u: u[index]`` to samples and rates."""
         return self._changed(self.t, change)
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> Signal:
@@ -114,7 +114,7 @@ class Signal:
         return made
 
     def __call__(self, time: Tensor | float) -> Tensor:
-        """Return u at a time, ``(*batch, M)``. At a jump the right value counts."""
+        """Return u at a time, ``(*batch, M)``. At a jump, return the value after it."""
         now, times = float(time), self._times
         last = len(times) - 1
         index = min(max(bisect.bisect_right(times, now) - 1, 0), last)
@@ -130,14 +130,14 @@ class Signal:
         return _combined(_cubic(weights), low, high, *(span * self._rates[index : index + 2]))
 
     def at(self, times: Tensor) -> Tensor:
-        """Return u at times ``(T,)``, ``(T, *batch, M)``. At a jump the right value counts."""
+        """Return u at times ``(T,)``, ``(T, *batch, M)``. At a jump, return the value after it."""
         return self._at(times, torch.searchsorted(self.t, times, right=True) - 1)
 
     def stages(self, grid: Tensor, nodes: tuple[float, ...]) -> Tensor:
         """Return u at the stages of each step, ``(T - 1, stages, *batch, M)``.
 
-        ``grid`` ``(T,)`` are the times of the steps, and ``nodes`` those of the stages in a step,
-        from 0 to 1. A stage at the end of a step has the left value of a held input.
+        ``grid`` ``(T,)`` holds the times of the steps, and ``nodes`` the times of the stages in a
+        step, from 0 to 1. At a jump, a stage at the end of a step sees the value before it.
         """
         start, end = grid[:-1], grid[1:]
         inner = [torch.lerp(start, end, node) for node in nodes[:-1]]
@@ -169,7 +169,7 @@ class Signal:
         return values.reshape(*values.shape, *[1] * (self.u.ndim - 1)).to(self.u)
 
     def _at(self, times: Tensor, index: Tensor) -> Tensor:
-        """Return u at times after the samples ``index``, from -1 on."""
+        """Return u at times. ``index`` is the sample before each time, -1 before the first."""
         last = self.t.shape[0] - 1
         if self.interpolation == "hold" or last == 0:
             return self._samples[index.clamp(0, last)]
@@ -229,7 +229,7 @@ def _cubic(s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _cubic_mean(s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return means of these weights from 0 to s."""
+    """Return the means of the weights of :func:`_cubic` over 0 to s."""
     square, cube = s**2, s**3
     rise = square - cube / 2
     return 1 - rise, rise, s / 2 - 2 * square / 3 + cube / 4, cube / 4 - square / 3

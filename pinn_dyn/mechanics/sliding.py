@@ -29,8 +29,9 @@ class Sliding:
 
     where a_free is the acceleration without friction at rest. For an ``implicit`` method, M is
     replaced by M + h D + h^2 K, with the stiffness K of drives and elastic joints. An active-set
-    method with a fixed number of passes finds the coordinates that stick. Gradients are those of
-    the step for the resulting set.
+    method with a fixed number of passes finds the coordinates that stick. Gradients hold this set
+    fixed.
+
     Source: Moreau (1988), "Unilateral contact and dry friction in finite freedom dynamics";
     Hintermueller, Ito and Kunisch (2002), "The primal-dual active set strategy as a semismooth
     Newton method".
@@ -38,7 +39,8 @@ class Sliding:
     Args:
         system: the system, with the state (q, v).
         x: state at the start of the step, ``(*batch, 2N)``.
-        inputs: input at the nodes of the step, ``(stages, *batch, M)``. Its mean decides the stops.
+        inputs: input at the nodes of the step, ``(stages, *batch, M)``. The mean input determines
+            the stops.
         h: length of the step, ``()``, s.
         implicit: true for a method that is stable where damping outweighs inertia.
 
@@ -100,7 +102,7 @@ class Sliding:
         return torch.cat([v, _solve(mass, force, self.stuck, -self._v / self.h)], dim=-1)
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return the function of :meth:`MechanicalSystem.implicit_solver` while the set holds."""
+        """Return :meth:`MechanicalSystem.implicit_solver` with the stuck coordinates fixed."""
         q, _ = x.chunk(2, dim=-1)
         mass = self.system.mass_matrix(q)
         inertia = mass + step * self.system.resistance_matrix(q, step)
@@ -119,8 +121,8 @@ class Sliding:
     def ended(self, start: Tensor, before: Tensor, after: Tensor) -> Tensor:
         """Return the increment after a step, with corrections for coordinates that stopped.
 
-        A coordinate that stopped moves by v(0) tau/2 before, and by v(h) (h - tau)/2 after its
-        stop. At rest, v is zero to the last digit.
+        A coordinate that stopped moves by v(0) tau/2 before its stop and by v(h) (h - tau)/2
+        after it. The velocity of a coordinate at rest is exactly zero.
         """
         position, velocity = after.chunk(2, dim=-1)
         origin = start.chunk(2, dim=-1)[1]
@@ -137,7 +139,7 @@ class Sliding:
 
 
 def hold(matrix: Tensor, fixed: Tensor) -> Tensor:
-    """Return a matrix with the rows and columns of fixed coordinates from the identity."""
+    """Replace the rows and columns of fixed coordinates by those of the identity matrix."""
     free = ~(fixed.unsqueeze(-1) | fixed.unsqueeze(-2))
     unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     return torch.where(free, matrix, unit)

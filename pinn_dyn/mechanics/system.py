@@ -21,7 +21,7 @@ from pinn_dyn.mechanics.sliding import Sliding
 
 
 class Terms(NamedTuple):
-    """Mass matrix M, damping matrix D, potential force G and input matrix A at a q."""
+    """Mass matrix M, damping matrix D, potential force G and input matrix A at a configuration."""
 
     M: Tensor
     D: Tensor
@@ -118,11 +118,11 @@ class MechanicalSystem(MechanicalTerms):
           tau lies in the range of A.
 
         If the force is not linear in u, :class:`InputSolver` finds u; for M > N, the solution
-        closest to :meth:`typical_input`. Entries are infinite or NaN where A loses its rank, or no
-        input gives the force.
+        closest to :meth:`typical_input`. Entries are infinite or NaN where A is rank-deficient or
+        no input gives the force.
 
         Raises:
-            ValueError: on shapes, or a model that :meth:`require_invertible_input` refuses.
+            ValueError: if a shape is wrong, or as :meth:`require_invertible_input`.
         """
         self.require_invertible_input()
         tau = self.inverse_dynamics(q, v, a)
@@ -148,10 +148,10 @@ class MechanicalSystem(MechanicalTerms):
 
     @final
     def require_invertible_input(self) -> None:
-        """Check that the model has inputs, and no residual force, which may depend on u.
+        """Check that the model has inputs and no residual force, which may depend on u.
 
         Raises:
-            ValueError: on a model without inputs, or with a residual force.
+            ValueError: if the model has no inputs, or has a residual force.
         """
         if not self.num_inputs:
             raise ValueError("the model has no inputs (u: []), so no control law can move it")
@@ -185,7 +185,7 @@ class MechanicalSystem(MechanicalTerms):
 
     @final
     def power(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return dE/dt = v^T (A u + r) - v^T (D v + F), ``(*batch,)``, W: supply less losses."""
+        """Return dE/dt = v^T (A u + r) - v^T (D v + F), ``(*batch,)``, W: supply minus losses."""
         self._check(q=q, v=v, u=u)
         supplied = self.applied_force(q, v, u) - self.dissipative_force(q, v)
         return (v * supplied).sum(-1)
@@ -214,7 +214,7 @@ class MechanicalSystem(MechanicalTerms):
 
     @final
     def sliding(self, x: Tensor, inputs: Tensor, h: Tensor, implicit: bool) -> Sliding:
-        """Return the dynamics of a step of h s from x with sticking friction."""
+        """Return the dynamics with sticking friction of a step from x that lasts h, ``()``, s."""
         return Sliding(self, x, inputs, h, implicit)
 
     @final
@@ -224,7 +224,7 @@ class MechanicalSystem(MechanicalTerms):
             (q, v):  J = [[0, 1], [-M^-1 K, -M^-1 D']]     (q, p):  J = [[0, M^-1], [-K, -D' M^-1]]
 
         D' = D + diag(dF_i/dv_i), and K is the stiffness of drives and elastic joints. With
-        r = (r_q, r_v) or (r_q, r_p), r_p = M r_v and E = (M + s D' + s^2 K)^-1 that is
+        r = (r_q, r_v) or (r_q, r_p), r_p = M r_v and E = (M + s D' + s^2 K)^-1, the solution is
         k_v = E (r_p - s K r_q), k_p = M k_v and k_q = r_q + s k_v.
         """
         q, v = x.chunk(2, dim=-1)

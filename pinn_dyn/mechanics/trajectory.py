@@ -47,7 +47,7 @@ class Trajectory:
         for name, value in (("q", self.q), ("v", self.v)):
             if value.shape != shape:
                 raise ValueError(
-                    f"{name} has shape {tuple(value.shape)}, expected {shape}, as u has"
+                    f"{name} has shape {tuple(value.shape)}, expected {shape} to match u"
                 )
 
     @property
@@ -66,21 +66,19 @@ class Trajectory:
         return float(self.t[-1] - self.t[0])
 
     def since(self, history: float) -> Trajectory:
-        """Return the motion from ``history`` s before the start on.
+        """Return the motion extended by ``history`` seconds before its start.
 
-        Unknown samples of q and u repeat the earliest sample: the robot was at rest. v before the
-        start repeats the first sample and has no meaning.
+        Unknown samples of q and u repeat the earliest known sample, as of a robot at rest. v before
+        the start repeats its first sample and has no meaning.
         """
         step = self.t[1] - self.t[0]
         count = math.ceil(history / float(step) - 1e-6)
         if count < 1:
             return self
         before = self.t[0] - step * torch.arange(count, 0, -1).to(self.t)
-        q, u = (
-            torch.cat([_extended(past, values, count), values], dim=-2)
-            for past, values in ((self.past_q, self.q), (self.past, self.u))
-        )
+        q = torch.cat([_extended(self.past_q, self.q, count), self.q], dim=-2)
         v = torch.cat([_extended(None, self.v, count), self.v], dim=-2)
+        u = torch.cat([_extended(self.past, self.u, count), self.u], dim=-2)
         input = Signal(torch.cat([before, self.t]), u, self.input.interpolation)
         return Trajectory(q, v, input, self.momentum)
 
@@ -113,8 +111,8 @@ class Trajectory:
     def to(self, device: torch.device | str) -> Trajectory:
         """Move the trajectory to a device."""
         names = ("q", "v", "input", "past", "past_q")
-        values = {name: getattr(self, name) for name in names}
-        return replace(self, **{k: x.to(device) for k, x in values.items() if x is not None})
+        values = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return replace(self, **{name: value.to(device) for name, value in values.items()})
 
     def until(self, horizon: float) -> Trajectory:
         """Return the part up to ``horizon`` seconds after the start.
@@ -146,7 +144,7 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
             raise ValueError(
                 f"trajectory {index} has interpolation {kind!r}, trajectory 0 {expected!r}"
             )
-        # Sample times are compared relative to the start of each trajectory.
+        # Compare sample times relative to the start of each trajectory.
         resolution = 4 * torch.finfo(item.t.dtype).eps * float(item.t.abs().max())
         same = item.t.shape == first.t.shape and torch.allclose(
             item.t - item.t[0], first.t - first.t[0], rtol=0, atol=max(1e-9, resolution)
@@ -167,9 +165,9 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
 
 
 def stack_until(trajectories: Sequence[Trajectory], duration: float | None = None) -> Trajectory:
-    """Stack the trajectories that are long enough, cut to a duration in s.
+    """Cut trajectories to a duration in s and stack them; leave out shorter trajectories.
 
-    All have the same sample time. The default duration is that of the shortest trajectory.
+    All must have the same sample time. The default is the duration of the shortest trajectory.
 
     Raises:
         ValueError: if no trajectory is long enough, or they cannot be stacked, see :func:`stack`.
@@ -183,12 +181,12 @@ def stack_until(trajectories: Sequence[Trajectory], duration: float | None = Non
 
 
 def _stacked(pasts: list[tuple[Tensor | None, Tensor]]) -> Tensor | None:
-    count = max(0 if past is None else past.shape[-2] for past, _ in pasts)
+    count = max((past.shape[-2] for past, _ in pasts if past is not None), default=0)
     return torch.stack([_extended(*item, count) for item in pasts]) if count else None
 
 
 def _extended(past: Tensor | None, values: Tensor, count: int) -> Tensor:
-    """Return the last ``count`` samples before values, filled up with the earliest sample."""
+    """Return ``count`` samples before values; repeat the earliest known sample where needed."""
     if past is None:
         past = values[..., :0, :]
     past = past[..., max(past.shape[-2] - count, 0) :, :]
@@ -198,7 +196,7 @@ def _extended(past: Tensor | None, values: Tensor, count: int) -> Tensor:
 
 
 def samples_of(name: str, duration: float, t: Tensor) -> int:
-    """Return the number of sample times of t ``(T,)`` in a duration in s, a positive integer."""
+    """Convert a duration in s to a number of sample times of t ``(T,)``."""
     steps = t.double().diff()
     sample_time = float(steps.mean())
     if float((steps - sample_time).abs().max()) > 1e-3 * sample_time:
@@ -209,7 +207,7 @@ def samples_of(name: str, duration: float, t: Tensor) -> int:
     count = round(duration / sample_time)
     if count < 1 or abs(duration / sample_time - count) > 1e-3:
         raise ValueError(
-            f"{name} is {duration} s and the sample time of the data is {sample_time:g} s: "
-            f"expected a {name} that is a positive integer multiple of it"
+            f"{name} is {duration} s, but the sample time of the data is {sample_time:g} s: "
+            f"{name} must be a positive integer multiple of the sample time"
         )
     return count

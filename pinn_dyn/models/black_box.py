@@ -18,8 +18,8 @@ from pinn_dyn.models.statistics import Statistics
 class NextStateMLP(Predictor):
     """x_{k+1} = x_k + s * network(x_k, u_k, u_{k+1}), the black box of the paper.
 
-    The state is x = (q, v), and s the standard deviation of its increment over a step, which is
-    that of the training windows.
+    The state is x = (q, v). s is the standard deviation of the increment of x over a step. The step
+    is that of the training windows.
 
     Args:
         statistics: scales of the data.
@@ -50,7 +50,7 @@ class NextStateMLP(Predictor):
         return float(self.step)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Apply the network step by step, of which ``t`` must have the length."""
+        """Apply the network step by step. The spacing of ``t`` must be the step."""
         self._require_step(t)
         x = torch.zeros_like(x0)
         path = [x]
@@ -61,15 +61,15 @@ class NextStateMLP(Predictor):
         return torch.stack(path, dim=-2)
 
     def increment(self, x: Tensor, u: Tensor, u_next: Tensor) -> Tensor:
-        """Return the increment of x over a step with u at its start and u_next at its end."""
+        """Return the increment of x over a step with input u at its start and u_next at its end."""
         return self.scale * self.network(torch.cat([x, u, u_next], dim=-1))
 
 
 class AccelerationMLP(ContinuousPredictor):
-    """dv/dt = s * network(q, v, u), integrated by the same RK4 as the structured models.
+    """dv/dt = s * network(q, v, u), integrated like the structured models.
 
-    dq/dt = v holds by construction, and any step is possible. s is the standard deviation of the
-    velocity increment over a step, divided by the step.
+    dq/dt = v holds by construction, and predictions may have any step. s is the standard deviation
+    of the velocity increment over a step, divided by the step.
 
     Args:
         statistics: scales of the data.

@@ -1,4 +1,4 @@
-"""Cholesky heads of the mass and the damping: maps to a positive diagonal, products, and limits."""
+"""Cholesky heads of mass and damping matrices, and limits of their outputs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from pinn_dyn.models.mlp import Activation, Tape, columns, rows
 from pinn_dyn.models.scales import Scales
 
 UNROLLED = 8
-"""Largest N for which the sums are unrolled, so that a compiler can fuse them. For larger N the
-graph would grow like N^2, and the library is faster, by a factor of 3 at N = 12."""
+"""Largest N for which sums are unrolled, which lets a compiler fuse them. For larger N the graph
+would grow like N^2, and the library is faster: three times at N = 12."""
 
 
 def square(factor: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ class Positive:
 
     Args:
         floor: smallest diagonal entry, in units of the scale; 0 allows a semi-definite matrix.
-        initial: initial diagonal entry without the floor; below 1 for a robot of little inertia.
+        initial: initial diagonal entry without the floor; below 1 for a robot with small inertia.
     """
 
     floor: NonNegativeFloat = 1e-3
@@ -107,8 +107,9 @@ Positivity = Positive | Bounded
 
 
 _DIAGONAL_MARGIN = 0.2
-"""Margin of the outputs beyond the data: a factor of at least exp(-0.2) = 0.82 for a softplus."""
-_CACHED = 1024  # configurations in a block whose values stay in the cache
+"""Margin of diagonal outputs beyond their range on the data. An entry by a softplus then exceeds
+0.82 = exp(-0.2) of its smallest value on the data."""
+_CACHED = 1024  # configurations in a block whose values fit into the cache
 _MARGIN = 0.1
 """Margin of all other outputs, in units of their range on the data."""
 
@@ -132,11 +133,11 @@ class CholeskyFactor(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
-        """Return L(q), dL for dq, and the tape."""
+        """Return L(q), its change dL along dq, and the tape."""
 
     @abc.abstractmethod
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
-        """Return the gradient of <cotangent, L(q)> in q, ``(*batch, N)``."""
+        """Return the gradient of <cotangent, L(q)> with respect to q, ``(*batch, N)``."""
 
     def forward(self, q: Tensor) -> Tensor:
         """Return L(q), ``(*batch, N, N)``."""
@@ -147,7 +148,7 @@ class CholeskyFactor(nn.Module, abc.ABC):
         return square(self(q).transpose(-1, -2) if self.transposed else self(q))
 
     def product(self, q: Tensor, x: Tensor) -> Tensor:
-        """Return the matrix times x, ``(*batch, N)``, by its factor: N^2 operations, not N^3."""
+        """Return the matrix times x, ``(*batch, N)``, in N^2 operations instead of N^3."""
         factor = self(q).transpose(-1, -2) if self.transposed else self(q)
         return matvec(factor, matvec(factor.transpose(-1, -2), x))
 
@@ -156,15 +157,16 @@ class NetworkCholesky(CholeskyFactor):
     """L(q) = diag(scale) * tril(network(q)), with a positive diagonal.
 
     The network has N (N + 1)/2 outputs y, the first N for the diagonal (paper, section Sub-Network
-    Structures), which ``positivity`` maps to the entries of L. Its input saturates outside the
-    data. After training y is replaced by c + m tanh((y - c)/m), with c = y clipped to its range on
-    the data and a margin m (0.2 on the diagonal, a tenth of the range elsewhere), which bounds the
-    eigenvalues of the matrix from both sides.
+    Structures). ``positivity`` maps y to the entries of L. The input of the network saturates
+    outside the data. After training, y is replaced by c + m tanh((y - c)/m), with c = y clipped to
+    its range on the data, and a margin m: 0.2 on the diagonal, and a tenth of the range elsewhere.
+    This bounds the eigenvalues of the matrix from both sides.
 
-    In a chain of bodies most entries of M = L^T L (``transposed``) are simpler functions of q than
-    in M = L L^T (Featherstone 2005, "Efficient factorization of the joint-space inertia matrix for
-    branched kinematic trees"). With revolute or prismatic joints from base to tip, column j of L in
-    M = L^T L, and in M^-1 = L L^T, depends only on the joints after j (``chain``, by a mask).
+    In a chain of bodies, the entries of L in M = L^T L (``transposed``) are simpler functions of q
+    than in M = L L^T (Featherstone 2005, "Efficient factorization of the joint-space inertia matrix
+    for branched kinematic trees"). With revolute or prismatic joints from base to tip, column j of
+    L in M = L^T L, and in M^-1 = L L^T, depends only on the joints after j (``chain``; a mask of
+    the network).
 
     Args:
         scales: scales of the data. The value is the typical size of the rows of L, or of its
@@ -201,12 +203,11 @@ class NetworkCholesky(CholeskyFactor):
             last = self.network.linears[-1]
             last.weight.mul_(0.1)
             last.bias[:size] = positivity.start
-        # vec(L) = y S, where S contains the scale and the position of each entry.
+        # vec(L) = y S with the placement S, which holds the scale and position of each entry.
         order = torch.cat([torch.arange(size) * (size + 1), row * size + column])
         placement = torch.zeros(len(order), size * size)
-        placement[torch.arange(len(order)), order] = scales.value.float()[
-            order % size if transposed else order // size
-        ]
+        sides = order % size if transposed else order // size
+        placement[torch.arange(len(order)), order] = scales.value.float()[sides]
         self.register_buffer("placement", placement)
         self.register_buffer("order", order.unsqueeze(1), persistent=False)
         self.register_buffer("output_limits", None)  # none during training
@@ -227,16 +228,16 @@ class NetworkCholesky(CholeskyFactor):
         return self.network.pullback(tape[:-1], rows(dy, cotangent[..., 0]))
 
     def limits_at(self, q: Tensor) -> Tensor:
-        """Return the smallest and largest outputs at q ``(B, N)``, and the margins, ``(3, K)``."""
+        """Return smallest outputs, largest outputs and margins at q ``(B, N)``, ``(3, K)``."""
         with torch.no_grad():
             y = torch.cat([self.network(part) for part in q.split(_CACHED)])
         low, high = y.amin(0), y.amax(0)
-        margin = (_MARGIN * (high - low)).clamp(min=1e-3)  # of an output that is constant
+        margin = (_MARGIN * (high - low)).clamp(min=1e-3)  # 1e-3 for constant outputs
         margin[: self.size] = _DIAGONAL_MARGIN
         return torch.stack([low, high, margin])
 
     def _entries(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the entries of L in units of its scale, diagonal first, and their slopes in y."""
+        """Return the entries of L in units of the scale, diagonal first, and their slopes in y."""
         if self.output_limits is None:
             return self._free_entries(y)
         low, high, margin = self.output_limits.reshape(3, -1, *[1] * (y.ndim - 1)).unbind()
@@ -251,11 +252,14 @@ class NetworkCholesky(CholeskyFactor):
         return torch.cat([diagonal, lower]), torch.cat([diagonal_slope, lower_slope])
 
     def _scales(self, y: Tensor) -> Tensor:
-        """Return the scale of each entry, shaped to be multiplied with y ``(K, ...)``."""
+        """Return the scale of each entry, with a shape that broadcasts with y ``(K, ...)``."""
         return self.placement.gather(1, self.order).reshape(-1, *[1] * (y.ndim - 1))
 
     def _assemble(self, values: Tensor) -> Tensor:
-        """Build L ``(N, N, ...)`` from its entries ``(K, ...)``. Indexing has a slower gradient."""
+        """Build L ``(N, N, ...)`` from its entries ``(K, ...)``, without indexing for small N.
+
+        The gradient of indexing is slower.
+        """
         values = values * self._scales(values)
         if self.size > UNROLLED:
             flat = values.new_zeros(self.size**2, *values.shape[1:])
@@ -283,7 +287,7 @@ def _matrices(square: Tensor, like: Tensor) -> Tensor:
     """Reshape ``(N, N, B)`` to ``(*batch, N, N)``, with the batch of ``like`` ``(*batch, k)``."""
     size = square.shape[0]
     matrices = rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
-    # Otherwise the library copies the matrix at every solve.
+    # Make it contiguous once; otherwise the library copies the matrix at every solve.
     return matrices.contiguous() if size > UNROLLED else matrices
 
 
@@ -299,7 +303,7 @@ class _ConstantFactor(CholeskyFactor):
 
 
 class ConstantCholesky(_ConstantFactor):
-    """L = diag(scale) * tril(parameters), the same at every q.
+    """L = diag(scale) * tril(parameters), constant.
 
     Args:
         scales: scales of the data. The value is the typical size of the rows of L, ``(N,)``.
@@ -323,7 +327,7 @@ class ConstantCholesky(_ConstantFactor):
 
 
 class FixedCholesky(_ConstantFactor):
-    """L = the Cholesky factor of a fixed symmetric positive semi-definite matrix.
+    """Cholesky factor L of a fixed symmetric positive semi-definite matrix.
 
     Args:
         scales: scales of the data.
@@ -346,7 +350,7 @@ class FixedCholesky(_ConstantFactor):
                 f"FixedCholesky: value is {value}, expected a symmetric positive semi-definite "
                 f"({size}, {size}) matrix"
             )
-        # A QR factor of the square root is a Cholesky factor, also of a singular matrix.
+        # The QR factor of the square root is a Cholesky factor, even if the matrix is singular.
         upper = torch.linalg.qr((vectors * eigenvalues.clamp(min=0).sqrt()).T).R
         sign = torch.where(upper.diagonal() < 0, -1.0, 1.0).to(upper)
         self.register_buffer("factor", (sign[:, None] * upper).T.float().contiguous())
@@ -360,19 +364,19 @@ _CONFIGURATIONS = 20_000  # largest number of evaluated configurations
 
 
 def output_limits(model: nn.Module, q: Tensor) -> dict[str, Tensor]:
-    """Compute the limits of the heads at training configurations q ``(K, N)``, by name."""
+    """Compute the output limits of all heads by name, from training configurations ``(K, N)``."""
     q = q[:: -(-len(q) // _CONFIGURATIONS)]
     return {f"{name}.{_NAME}": head.limits_at(q) for name, head in _heads(model)}
 
 
 def set_output_limits(model: nn.Module, limits: Mapping[str, Tensor]) -> None:
-    """Set the limits of the heads of a model by name, and remove all other limits."""
+    """Set the output limits of the heads of a model by name; remove limits that are not named."""
     for name, head in _heads(model):
         head.output_limits = limits.get(f"{name}.{_NAME}")
 
 
 def free_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights of a checkpoint without limits."""
+    """Return the weights of a checkpoint without output limits."""
     return {name: value for name, value in weights.items() if not name.endswith(f".{_NAME}")}
 
 

@@ -15,30 +15,30 @@ from pinn_dyn.models.scales import Scales
 
 _SHARPNESS = 16  # the torque is 0.96 of its limit where the command reaches the limit
 _BEYOND = 100.0  # ratio to the limit beyond which the torque is constant
-_LINEAR = 0.8  # ratio below which the torque is that of the command to 0.2 %
-_REACHABLE = 0.98  # of the limit, for which a command exists
-_SMALLEST = 1e-3  # smallest limit in units of that at rest, beyond the no-load speed
+_LINEAR = 0.8  # ratio below which the torque equals the command to 0.2 %
+_REACHABLE = 0.98  # part of the limit that a command can reach
+_SMALLEST = 1e-3  # limit beyond the no-load speed, in units of the limit at rest
 
 Limit = PositiveFloat | Sequence[PositiveFloat] | Literal["learned"] | None
 
 
 class DriveLimits(HasConstants):
-    """Torque tau of a drive whose command asks for the torque s, as of a DC motor::
+    """Torque tau of a drive, such as a DC motor, with the commanded torque s::
 
         l(w) = min(L, S (1 - w / w_0)),    -l(-v) <= tau <= l(v)
         tau = c + h x / (1 + |x|^16)^(1/16),    x = (s - c) / h,    c, h = (l(v) -+ l(-v)) / 2
 
-    L is the torque of the largest current, S the stall torque and w_0 the no-load speed, both at
-    the largest voltage. In braking, only the current is a limit. Beyond w_0, l is 0.001 of its
-    value at rest. Symbols: L and S ``(n,)`` in Nm or N, w_0 in rad/s or m/s, s, tau and v
+    L is the torque at the largest current; S is the stall torque and w_0 the no-load speed at the
+    largest voltage. While braking, only the current limits the torque. Beyond w_0, l is 0.001 of
+    its value at rest. Symbols: L and S ``(n,)`` in Nm or N, w_0 in rad/s or m/s, s, tau and v
     ``(*batch, n)``, all at the joint. Assumptions: a stiff gear, constant voltage and temperature.
     Source: Spong, Hutchinson, Vidyasagar 2006, Robot Modeling and Control, sec. 6.2.
 
     Args:
         scales: scales of the n driven joints. The value is the typical torque, ``(n,)``.
         limit: L, one number or n; ``"learned"``; or None for no limit of the current.
-        stall: S, likewise; needs ``no_load_speed``.
-        no_load_speed: w_0, likewise.
+        stall: S, like ``limit``; needs ``no_load_speed``.
+        no_load_speed: w_0, like ``limit``; needs ``stall``.
         spread: prior standard deviation of the logarithm of learned limits.
 
     Raises:
@@ -77,18 +77,18 @@ class DriveLimits(HasConstants):
             self.register_buffer(f"fixed_{name}", number.expand(len(joints)).clone())
 
     def forward(self, force: Tensor, v: Tensor) -> Tensor:
-        """Return tau, ``(*batch, n)``, of the commanded force at v."""
+        """Return tau, ``(*batch, n)``, for the commanded force s at the velocity v."""
         center, half = self._range(v)
         ratio = ((force - center) / half).clamp(-_BEYOND, _BEYOND)
         return center + half * ratio / (1 + ratio**_SHARPNESS) ** (1 / _SHARPNESS)
 
     def saturated(self, force: Tensor, v: Tensor) -> Tensor:
-        """Return where the torque is not that of the command, ``(*batch, n)``, bool."""
+        """Return true where the torque deviates from the command, ``(*batch, n)``, bool."""
         center, half = self._range(v)
         return (force - center).abs() > _LINEAR * half
 
     def reachable(self, force: Tensor, v: Tensor) -> Tensor:
-        """Return the nearest force for which there is a command, ``(*batch, n)``."""
+        """Return the nearest force that a command can reach, ``(*batch, n)``."""
         center, half = self._range(v)
         return force.clamp(center - _REACHABLE * half, center + _REACHABLE * half)
 
@@ -101,10 +101,8 @@ class DriveLimits(HasConstants):
 
     def _range(self, v: Tensor) -> tuple[Tensor, Tensor]:
         """Return c and h, ``(*batch, n)``."""
-        most = self.at_rest()
-        stall, speed = self._value("stall"), self._value("speed")
-        ends = [
-            torch.minimum(most, stall - stall / speed * w).clamp_min(0.0) + _SMALLEST * most
-            for w in (v, -v)
-        ]
-        return (ends[0] - ends[1]) / 2, (ends[0] + ends[1]) / 2
+        limit, stall = self.at_rest(), self._value("stall")
+        drop = stall / self._value("speed") * v
+        forward = torch.minimum(limit, stall - drop).clamp_min(0.0)
+        backward = torch.minimum(limit, stall + drop).clamp_min(0.0)
+        return (forward - backward) / 2, (forward + backward) / 2 + _SMALLEST * limit

@@ -1,4 +1,4 @@
-"""Drives between inputs and joints, and the terms that they add to the equation of motion."""
+"""Drives between inputs and joints, and their terms in the equation of motion."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ class Drives(HasConstants, InputMatrix):
     """Drives of n joints. A subclass adds forces, springs and damping to the equation of motion.
 
     Attributes:
-        selection: rows of the identity matrix that are the driven joints, ``(n, N)``.
+        selection: rows of the identity matrix for the driven joints, ``(n, N)``.
         gain: learned drive gains, or None.
-        identified_by_forces: true if the force of a filtered input is the filtered force.
-        limited: true if the drives do not reach the force of each command.
+        identified_by_forces: true if filtering the input has the same effect as filtering the
+            force, which allows a fit of filtered forces.
+        limited: true if some commands exceed the largest force.
         takes_targets: true if the inputs are target positions instead of forces.
         initial_strength: :meth:`strength` at the start, ``(n,)``.
 
@@ -70,23 +71,23 @@ class Drives(HasConstants, InputMatrix):
         return None
 
     def force_range(self, v: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Return the least and the largest force at v, ``(*batch, N)``, or None without limits."""
+        """Return the smallest and largest force at v, ``(*batch, N)``, or None without limits."""
         return None
 
     def saturated(self, v: Tensor, u: Tensor) -> Tensor:
-        """Return where a drive does not reach the force of its command, ``(*batch, N)``, bool."""
+        """Return true where a drive does not reach its command, ``(*batch, N)``, bool."""
         return torch.zeros_like(v, dtype=torch.bool)
 
 
 class TorqueDrives(Drives):
-    """Drives with a gain k and limits l, whose force is ``l(k u, v)``.
+    """Drives with the force ``l(k u, v)``, with gains k and limits l.
 
     Args:
         scales: scales of the data. The value is the typical force, ``(N,)``.
         gain: initial k, ``(n,)``, such as in Nm/A.
         gain_spread: prior standard deviation of log k; 0 if the input is a force.
         limits: builder of the limits.
-        joints: as of :class:`Drives`.
+        joints: see :class:`Drives`.
     """
 
     def __init__(
@@ -112,7 +113,8 @@ class TorqueDrives(Drives):
             force = scales.value[self.joints]
             self.limits = limits(replace(scales, named=motors, value=force))
             self.affine, self.limited = False, True
-            self.identified_by_forces = not self.limits.learned  # zero limits and bodies would fit
+            # A fit of filtered forces with learned limits would find zero limits and zero bodies.
+            self.identified_by_forces = not self.limits.learned
 
     def strength(self) -> Tensor:
         return self.initial_strength if self.gain is None else self.gain()
@@ -147,8 +149,8 @@ class TorqueDrives(Drives):
             return None
         speed = v @ self.selection.mT
         far = torch.full_like(speed, torch.inf)
-        least, largest = (self.limits.reachable(x, speed) @ self.selection for x in (-far, far))
-        return least, largest
+        smallest = self.limits.reachable(-far, speed) @ self.selection
+        return smallest, self.limits.reachable(far, speed) @ self.selection
 
     def saturated(self, v: Tensor, u: Tensor) -> Tensor:
         if self.limits is None:

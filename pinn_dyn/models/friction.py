@@ -1,4 +1,4 @@
-"""Heads for dry friction. Each law adds one effect to the law before it, and all are passive."""
+"""Heads for dry friction. Each law adds an effect to the previous law, and all are passive."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pinn_dyn.models.scales import Scales
 
 _NO_LOSS = -8.0  # z of a loss by load that is all but zero
 _SMALLEST_WIDTH = 0.01
-"""In units of the typical speed. A jump in the force could not be integrated."""
+"""Smallest width in units of the typical speed. A jump in the force could not be integrated."""
 
 
 class Friction(HasConstants, abc.ABC):
     """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0.
 
-    With ``sticking``, rollouts use :meth:`sliding` instead of F. With ``by_load``, a part of the
-    force of the drives is lost, see :meth:`transmitted`.
+    If ``sticking`` is true, rollouts use :meth:`sliding` instead of F. If ``by_load`` is true, a
+    part of the drive force is lost, see :meth:`transmitted`.
     """
 
     sticking: bool = False
@@ -32,21 +32,25 @@ class Friction(HasConstants, abc.ABC):
 
     @abc.abstractmethod
     def slope(self, v: Tensor) -> Tensor:
-        """Return dF_i/dv_i >= 0, ``(*batch, N)``. F_i depends on v_i alone."""
+        """Return dF_i/dv_i >= 0, ``(*batch, N)``. F_i depends only on v_i."""
 
     def sliding(self, v: Tensor, share: Tensor) -> Tensor:
-        """Return the force at speed |v| of coordinates that slide forward in a share of the time.
+        """Return the sliding friction at the speed |v|, ``(*batch, N)``.
 
-        The default is F(v), without a jump at v = 0.
+        ``share`` (0 to 1) is the part of the time in which a coordinate slides forward. The default
+        is F(v), without a jump at v = 0.
         """
         return self(v)
 
     def absent(self) -> dict[Tensor, float]:
-        """Return parameters z of an optional effect, with the values at which it is absent."""
+        """Return the parameters z of optional effects, and the values that switch them off."""
         return {}
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        """Return the joint force after transmission losses, ``(*batch, N)``. By default none."""
+        """Return the joint force after transmission losses, ``(*batch, N)``.
+
+        The default transmits the full drive force.
+        """
         return force
 
 
@@ -66,10 +70,10 @@ class NoFriction(Friction):
 class CoulombFriction(Friction):
     """Smooth Coulomb law F_i(v) = c_i tanh(v_i / w_i) with learned c_i > 0 and w_i > 0.
 
-    c_i is the friction level of coordinate i (N or Nm), of which the force has reached 76 % at the
-    speed w_i (m/s or rad/s). A ``sticking`` law is smooth for control laws, torques and the
-    identification only. Its rollouts use the limit of w = 0, in which a coordinate at rest under a
-    load below c_i does not move (:class:`~pinn_dyn.mechanics.sliding.Sliding`). Source:
+    c_i is the friction level of coordinate i (N or Nm). At the speed w_i (m/s or rad/s), the force
+    is 76 % of c_i. A ``sticking`` law is smooth only in control laws, torques and the
+    identification. Rollouts use its limit w = 0, in which a coordinate at rest under a load below
+    c_i does not move (:class:`~pinn_dyn.mechanics.sliding.Sliding`). Source:
     Armstrong-Helouvry, Dupont and Canudas de Wit (1994), "A survey of models, analysis tools and
     compensation methods for the control of machines with friction".
 
@@ -103,10 +107,13 @@ class CoulombFriction(Friction):
         self._add_constants(scales)
 
     def _add_constants(self, scales: Scales) -> None:
-        """Add more constants in a subclass."""
+        """Add the constants of a subclass."""
 
     def physical_constants(self) -> list[Named]:
-        """Return the constants of the law. Stiction and a low-pass filter look like a width."""
+        """Return the constants of the law. Data give only an upper limit of the width.
+
+        Stiction and low-pass filters have the same effect as a width.
+        """
         width = self.width.named()._replace(lower=0.0, upper_limit=True)
         return [*self._levels(), width]
 
@@ -139,7 +146,7 @@ class CoulombFriction(Friction):
 
 
 class AsymmetricCoulomb(CoulombFriction):
-    """Coulomb law with the level c+ for v > 0 and c- for v < 0, as worn gears have."""
+    """Coulomb law with a level c+ for v > 0 and c- for v < 0, for worn gears."""
 
     def _add_constants(self, scales: Scales) -> None:
         # c+ is the level times the asymmetry, c- is the level divided by the asymmetry.
@@ -187,11 +194,11 @@ class Stribeck(AsymmetricCoulomb):
 
 
 class LoadDependent(AsymmetricCoulomb):
-    """Coulomb law by direction, and a loss that grows with the force f_i of the drive::
+    """Coulomb law by direction, and a loss that is proportional to the force f_i of the drive::
 
         transmitted_i = f_i - l_i |f_i| tanh(v_i / w_i),      0 < l_i < 1
 
-    So the friction of a moving joint is c_i + l_i |f_i|. At rest only c_i holds the joint. Source:
+    The friction of a moving joint is c_i + l_i |f_i|. At rest, only c_i holds the joint. Source:
     model M3 of Duclusaud et al. (2025), "Extended friction models for the physics simulation of
     servo actuators", with the force of the drive as the load.
     """
@@ -214,6 +221,6 @@ class LoadDependent(AsymmetricCoulomb):
         return force - self._loss() * force.abs() * torch.tanh(v / self.width())
 
     def _loss(self) -> Tensor:
-        """Return l, ``(N,)``."""
+        """Return the loss l, ``(N,)``."""
         odds = self.odds()
         return odds / (1 + odds)

@@ -1,4 +1,4 @@
-"""Hamiltonian network with a learned inverse mass, V, D and A, in the state (q, p) or (q, v)."""
+"""Hamiltonian network with learned M^-1, V, D and A, in the state (q, p) or (q, v)."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class HamiltonianNetwork(structured.StructuredNetwork):
 
         dq/dt = W p,    dp/dt = -G - d(p^T W p / 2)/dq - D W p + A u
 
-    With ``state="qv"`` the same equations are written in the state (q, v), with p = W^-1 v, and
-    need no momenta, which cannot be measured::
+    With ``state="qv"``, the same equations in the state (q, v), with p = W^-1 v, need no data of
+    momenta, which cannot be measured::
 
         dq/dt = v,    dv/dt = (dW/dt) p + W dp/dt
 
-    If A is learned, the scale of the energies is then arbitrary: W / c with c V, c D and c A gives
-    the same motion.
+    If A is learned in this state, the scale of the energies is arbitrary: W / c with c V, c D and
+    c A gives the same motion.
 
     Args:
         statistics: scales of the data.
@@ -73,7 +73,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         return self.inverse_mass.matrix(q)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        # Not cholesky_inverse: torch 2.13 gets its forward-mode derivative wrong.
+        # Avoid cholesky_inverse, whose forward-mode derivative is wrong in torch 2.13.
         factor = self.inverse_mass(q)
         eye = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
         inverse = torch.stack([lower_solve(factor, row.expand_as(q)) for row in eye], dim=-1)
@@ -100,7 +100,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         return -self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
 
     def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """Return M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v and dW along v."""
+        """Return M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v."""
         factor, bias, mass_rate_p = self._factor_and_rates(q, v)
         return upper_solve(factor, lower_solve(factor, a - mass_rate_p)) + bias
 
@@ -110,7 +110,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         return rate_p + matvec(factor, matvec(factor.transpose(-1, -2), net_force))
 
     def _factor_and_rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return L, d(p^T W p / 2)/dq and (dW/dt) p, with p = M v and the rate along v."""
+        """Return L, d(p^T W p / 2)/dq and (dW/dt) p, with p = M v."""
         factor, rate, tape = self.inverse_mass.linearize_along(q, v)
         w = lower_solve(factor, v)
         p = upper_solve(factor, w)

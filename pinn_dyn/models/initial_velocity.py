@@ -1,4 +1,4 @@
-"""The head for a learned initial velocity of a rollout."""
+"""Head for a learned initial velocity of a rollout."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pinn_dyn.models.scales import Scales
 
 
 class LearnedVelocity(nn.Module):
-    """v_0 = v + s_v * network(q, v, u), for velocities that are estimated instead of measured.
+    """v_0 = v + s_v * network(q, v, u), for velocities that are not measured but estimated.
 
-    The head starts at v_0 = v and is trained together with the dynamics. Source: Beintema,
+    Before the training, v_0 = v. The head is trained together with the dynamics. Source: Beintema,
     Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system identification".
 
     Args:

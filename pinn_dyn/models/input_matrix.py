@@ -1,4 +1,4 @@
-"""Heads for the input matrix: learned, fixed, or dependent on the input."""
+"""Heads for the input matrix: learned, fixed, or a function of the input."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ class InputMatrix(nn.Module, abc.ABC):
         return matvec(self(q), u)
 
     def applied(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return the force without that of springs and damping, ``(*batch, N)``."""
+        """Return the force of the inputs without springs and damping, ``(*batch, N)``."""
         return self.force(q, u)
 
     def spring_energy(self, q: Tensor) -> Tensor | float:
-        """Return the energy of the springs of the drives, ``(*batch,)``."""
+        """Return the spring energy of the drives, ``(*batch,)``, J."""
         return 0.0
 
     def spring_force(self, q: Tensor) -> Tensor | float:
-        """Return the slope of the energy of the springs of the drives, ``(*batch, N)``."""
+        """Return the gradient of the spring energy of the drives, ``(*batch, N)``."""
         return 0.0
 
     def stiffness_matrix(self) -> Tensor | None:
@@ -59,11 +59,11 @@ class InputMatrix(nn.Module, abc.ABC):
         return 0.0
 
     def typical_input(self, q: Tensor) -> Tensor:
-        """Return a typical input of a force that is not linear in it, ``(*batch, M)``."""
+        """Return a typical input ``(*batch, M)``, for a force that is not linear in the input."""
         return q.new_zeros(*q.shape[:-1], self.shape[1])
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """Return the initial root mean square of each force, ``(N,)``; 1 without an input."""
+        """Return the initial root mean square of each force, ``(N,)``; 1 if there is no input."""
         force = u_rms.square().mean().sqrt() if len(u_rms) else u_rms.new_ones(())
         return force.expand(self.shape[0])
 
@@ -71,7 +71,7 @@ class InputMatrix(nn.Module, abc.ABC):
 class NetworkInput(InputMatrix):
     """A(q) = scale_j * network(q), reshaped to N x M (paper, figure A-NN).
 
-    The input of the network saturates outside the data, so that A is bounded.
+    The input of the network saturates outside the data. A is therefore bounded.
 
     Args:
         scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
@@ -94,11 +94,11 @@ class NetworkInput(InputMatrix):
 class NonlinearInput(InputMatrix):
     """tau = A(q, u) u with A(q, u) = scale_j * network(q, u), reshaped to N x M.
 
-    This head is for inputs that are positions instead of forces, such as motors of tendons: a
+    This head is for inputs that are positions instead of forces, such as the motors of tendons. A
     tightened tendon becomes stiffer and pulls in a different direction.
 
     The columns of the ``linear`` inputs are constants, and the network does not depend on these
-    inputs, which prevents overfitting to motor rates.
+    inputs. This prevents overfitting to motor rates.
 
     Args:
         scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
@@ -125,14 +125,17 @@ class NonlinearInput(InputMatrix):
         size, inputs = self.shape
         self.curved = [k for k in range(inputs) if k not in linear]
         if len(self.curved) + len(linear) != inputs or not self.curved:
-            raise ValueError(f"linear is {list(linear)}, expected some of the {inputs} inputs")
+            raise ValueError(
+                f"linear is {list(linear)}, expected different inputs from 0 to {inputs - 1}, but "
+                "not all inputs"
+            )
         data, curved = scales.statistics, len(self.curved)
         mean = torch.cat([data.q_mean, data.u_mean[self.curved]])
         std = torch.cat([data.q_std, data.u_std[self.curved]])
         sizes = size + curved, size * curved
         self.network = MLP(*sizes, hidden, activation, mean, std, scales.angles)
         self.constant = nn.Parameter(torch.zeros(size, len(linear))) if linear else None
-        # Position of each input in [curved, linear].
+        # Position of each input in the list [curved, linear].
         self.order = sorted(range(inputs), key=[*self.curved, *linear].__getitem__)
         self.register_buffer("scale", scales.value.float())
         self.register_buffer("u_mean", data.u_mean.float())
@@ -158,7 +161,7 @@ class NonlinearInput(InputMatrix):
 
 
 class ConstantInput(InputMatrix):
-    """A = scale * parameters, the same at every q, with a scale ``(M,)`` of the columns."""
+    """A = scale * parameters, constant, with a scale ``(M,)`` of the columns."""
 
     scale: Tensor
 
@@ -173,7 +176,7 @@ class ConstantInput(InputMatrix):
 
 
 class NoInput(InputMatrix):
-    """A = 0, for a part of a sum that has no drives."""
+    """A = 0, for a part of a sum without drives."""
 
     def forward(self, q: Tensor) -> Tensor:
         return q.new_zeros(*q.shape[:-1], *self.shape)
@@ -183,7 +186,7 @@ class NoInput(InputMatrix):
 
 
 class FixedInput(InputMatrix):
-    """A = a fixed constant matrix.
+    """A fixed constant input matrix A.
 
     Args:
         scales: scales of the data.
@@ -211,5 +214,5 @@ class FixedInput(InputMatrix):
     def typical_force(self, u_rms: Tensor) -> Tensor:
         """Return the root mean square of A u for uncorrelated inputs, ``(N,)``."""
         force = (self.value.to(u_rms).square() @ u_rms.square()).sqrt()
-        # A coordinate without a direct input is moved by its neighbours.
+        # The neighbors move a coordinate without a direct input.
         return torch.where(force > 0, force, super().typical_force(u_rms))

@@ -30,6 +30,7 @@ from pinn_dyn.models.structured import FrictionHead
 
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the ten inertial parameters of a body."""
+_UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
 _GENERIC_SPREAD = 3.0
 
 
@@ -38,45 +39,47 @@ class KnownMechanics(LearnedConstants):
 
         (M(q) + diag(r)) a + C(q, v) v + G(q) + k_s (q - q_0) - o + D v + F(v) = A u
 
-    M, C and G are those of the ``structure`` with learned pseudo-inertias. r is the armature
+    M, C and G are the terms of the ``structure`` with learned pseudo-inertias. r is the armature
     (inertia of the rotors at the joint), o a constant torque, D = diag(d) viscous friction and F
-    dry friction. k_s and q_0 are the stiffness and the rest position of ``springs``, which have no
-    o besides. A ``(N, M)`` is diag(k) without the columns of passive joints, which have friction
-    but no armature and no constant torque. k are the drive gains from the input to the torque, such
-    as in Nm/A. Bodies have a positive density, and r, d, k > 0 for all values of the parameters,
-    which are standard normal a priori (:mod:`.known_constants`). Scales come from the data: with
-    the typical torque f = k u, d ~ f/v, F ~ f, o ~ f, r ~ f/a. At a passive joint f is the rigid
-    force of the initial bodies at typical states.
+    dry friction. k_s and q_0 are the stiffness and the rest position of ``springs``; joints with a
+    spring have no o. A ``(N, M)`` is diag(k) without the columns of passive joints. Passive joints
+    have friction, but no armature and no constant torque. k are the drive gains from the input to
+    the torque, for example in Nm/A. For all values of the parameters, bodies have a positive
+    density, and r, d, k > 0. The prior of the parameters is standard normal
+    (:mod:`.known_constants`). Scales come from the data: with the typical torque f = k u, d ~ f/v,
+    F ~ f, o ~ f, r ~ f/a. At a passive joint, f is the rigid force of the initial bodies at typical
+    states.
 
-    Other drives (``input``) may add springs and damping: with :class:`~.servo.Servo` the inputs are
-    targets, and k is the stiffness. With :class:`ElasticJoints` the coordinates are link and motor
-    angles, and the inputs drive the motors. With :class:`DriveLimits` or
-    :class:`~.friction.LoadDependent` friction, the drives limit k u or lose a part of it.
+    Other drives (``input``) may add springs and damping. With :class:`~.servo.Servo`, the inputs
+    are targets, and k is the stiffness. With :class:`ElasticJoints`, the coordinates are link and
+    motor angles, and the inputs drive the motors. :class:`DriveLimits` limit k u, and
+    :class:`~.friction.LoadDependent` friction loses a part of it.
 
     Args:
         statistics: scales of the data.
         structure: the kinematics, such as a :class:`~pinn_dyn.systems.RigidChain`.
-        start: ``"prior"`` starts from the bodies of the description, which are the ground truth for
-            a simulated robot, and from generic ones for bodies that cannot exist; ``"generic"``
-            starts from rods along the links.
+        start: ``"prior"`` starts from the bodies of the robot description, which are the ground
+            truth for a simulated robot. A body that cannot exist is replaced by a generic body.
+            ``"generic"`` starts from rods along the links.
         spread: prior standard deviation of the bodies, see :class:`PhysicalBodies`: 0.3 for a data
-            sheet, 3 for generic bodies (with 1 their intervals are too narrow). A mapping has names
-            of bodies, and ``default`` for all others. Generic bodies for ones that cannot exist
-            have at least 3.
+            sheet, 3 for generic bodies (with 1 their intervals are too narrow). A mapping has the
+            names of bodies as keys, and ``default`` for all other bodies. Generic bodies that
+            replace impossible bodies have at least 3.
         friction: builder of the dry friction.
         drive_gain: initial k, one number or M. It is learned if ``gain_spread`` is positive.
         gain_spread: prior standard deviation of log k; 0 if the input is a torque.
         integrator: the integration method; Rosenbrock if friction dominates inertia.
         driven_joints: names of the joints that the inputs drive, in the order of the inputs. The
             default is all joints, the motors of elastic joints, or none if the data have no inputs.
-        input: builder of other drives, such as servos, if the inputs are targets; k is then
+        input: builder of other drives, such as servos, whose inputs are targets. Their k is
             ``input.stiffness``.
         springs: names of the joints with a linear spring to their parent (:class:`JointSprings`).
-        limits: builder of the limits of the drives, if k u is a command that they may not reach.
+        limits: builder of the limits of the drives, if k u is a command that may exceed them.
 
     Raises:
-        ValueError: if the structure has no rigid bodies or other joints than the data or the
-            springs, ``spread`` names other bodies, or other drives have limits or losses besides.
+        ValueError: if the structure has no rigid bodies, its joints do not match the data or the
+            springs, ``spread`` names unknown bodies, or ``input`` is combined with limits or
+            losses.
     """
 
     def __init__(
@@ -99,7 +102,7 @@ class KnownMechanics(LearnedConstants):
                 f"structure is a {type(structure).__name__}, expected rigid bodies such as a "
                 "RigidChain: use model=known_system for the constants of other systems"
             )
-        structure = copy.deepcopy(structure)  # its numbers become those of the model
+        structure = copy.deepcopy(structure)  # the model converts the numbers of its copy
         names = structure.joint_names
         driven = _driven_joints(statistics, structure, driven_joints, input is not None)
         if unknown := set(springs) - set(names):
@@ -115,7 +118,7 @@ class KnownMechanics(LearnedConstants):
             guessed = (bodies == generic).flatten(1).all(1)
             spreads = torch.where(guessed, spreads.clamp(min=_GENERIC_SPREAD), spreads)
         self.bodies = PhysicalBodies(bodies, spreads, structure.body_names)
-        # Rods for the links of an arm. The last body has no link, so a single rod has no size.
+        # Generic rods model the links of an arm. A single body has no link, so its rod has no size.
         largest = 100.0 if len(driven) > 1 else math.inf
         self._largest_ratio = 5.0 if spreads.median() <= 1 else largest
         gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
@@ -174,7 +177,7 @@ class KnownMechanics(LearnedConstants):
     def _typical_forces(
         self, statistics: Statistics, bodies: Tensor, driven: Tensor | None
     ) -> Tensor:
-        """Return f ``(N,)``, with the forces of driven joints ``(M,)`` if they are known."""
+        """Return f ``(N,)``. ``driven`` ``(M,)`` holds the forces of driven joints, if known."""
         force = torch.zeros(self.num_coordinates).double()
         if driven is None or len(driven) < len(force):
             noise = torch.randn(3, 500, len(force), generator=torch.Generator().manual_seed(0))
@@ -208,19 +211,19 @@ class KnownMechanics(LearnedConstants):
 
     def physical_constants(self) -> list[Named]:
         """Return bodies, drives, friction and gains in SI units."""
-        table = self.body_parameters()
+        columns = self.body_parameters().unbind(-1)
         constants = []
-        for column, label in enumerate(INERTIAL):
-            unit = "kg" if column == 0 else "kg m" if column < 4 else "kg m^2"
+        for label, unit, values in zip(INERTIAL, _UNITS, columns, strict=True):
             names = [f"{label} of {body}" for body in self.structure.body_names]
             lower = 0.0 if label in ("mass", "Ixx", "Iyy", "Izz") else -float("inf")
-            constants.append(Named(names, [unit] * len(names), table[:, column], lower))
+            constants.append(Named(names, [unit] * len(names), values, lower))
         drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
         if self.elastic is not None:
             drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
         drives += self.friction.physical_constants()
         drives += self.drives.physical_constants()
-        drives += [] if self.springs is None else self.springs.physical_constants()
+        if self.springs is not None:
+            drives += self.springs.physical_constants()
         return constants + drives
 
     def body_parameters(self) -> Tensor:
@@ -229,7 +232,7 @@ class KnownMechanics(LearnedConstants):
 
     @property
     def gain(self) -> Constants | None:
-        """Learned drive gains, if any."""
+        """Learned drive gains, or None."""
         return self.drives.gain
 
     def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
@@ -256,8 +259,8 @@ class KnownMechanics(LearnedConstants):
     ) -> Tensor:
         """Return r a + D v + F + k_s q - o - motor force, ``(*batch, N)``.
 
-        F is the smooth law, or the sliding friction of a share of forward motion. The terms Y pi
-        and the forces of elastic joints are not in this force.
+        Without ``share``, F is the smooth law. With the share of forward motion, F is the sliding
+        friction. The terms Y pi and the forces of elastic joints are not included.
         """
         friction = self.friction(v) if share is None else self.friction.sliding(v, share)
         resistance = self.rotor_inertia() * a + self.viscous() * v + friction
@@ -266,17 +269,17 @@ class KnownMechanics(LearnedConstants):
         return resistance - self.constant_force() - self.motor_force(q, v, u)
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
-        """Return the ratio of the forces of bodies and armatures per input, at driven joints.
+        """Return the ratio of fitted to initial forces per input, and its largest likely value.
 
-        At a passive joint the forces of the right bodies cancel.
+        The forces are those of bodies and armatures at the driven joints. At a passive joint, the
+        forces of the correct bodies cancel.
         """
         fitted = self.structure.rigid_force(q, v, a, self.bodies(), gravity=True)
         initial = self.structure.rigid_force(q, v, a, self.bodies.start(), gravity=True)
         ratio = (fitted + self.rotor_inertia() * a).norm(dim=0) / initial.norm(dim=0)
         ratio = torch.where(initial.norm(dim=0) > 0, ratio, 1.0)  # a motor has no body
-        return ratio[
-            self.driven
-        ] * self.drives.initial_strength / self.input_gain(), self._largest_ratio
+        gain_ratio = self.input_gain() / self.drives.initial_strength
+        return ratio[self.driven] / gain_ratio, self._largest_ratio
 
     def slopes(self) -> KnownSlopes:
         return KnownSlopes(self)
@@ -315,17 +318,17 @@ class KnownMechanics(LearnedConstants):
         ends = self.drives.force_range(v)
         if ends is None:
             return tau
-        least, largest = (self.friction.transmitted(v, force) for force in ends)
-        return tau.clamp(least, largest)
+        smallest, largest = (self.friction.transmitted(v, force) for force in ends)
+        return tau.clamp(smallest, largest)
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        matrices = [
-            self.drives.stiffness_matrix(),
-            None if self.springs is None else torch.diag(self.springs.springs()),
-            None if self.elastic is None else self.elastic.matrices()[0],
-        ]
-        present = [matrix for matrix in matrices if matrix is not None]
-        return torch.stack(present).sum(0) if present else None
+        drives = self.drives.stiffness_matrix()
+        matrices = [] if drives is None else [drives]
+        if self.springs is not None:
+            matrices.append(torch.diag(self.springs.springs()))
+        if self.elastic is not None:
+            matrices.append(self.elastic.matrices()[0])
+        return torch.stack(matrices).sum(0) if matrices else None
 
     def spring_force(self, q: Tensor) -> Tensor:
         """Return the part of G from drives, springs and elastic joints, ``(*batch, N)``."""
@@ -375,7 +378,7 @@ def _driven_joints(
         raise ValueError(
             f"the data have {sizes[0]} coordinates and {sizes[1]} inputs, expected the "
             f"{len(names)} joints {', '.join(names)} and inputs of {', '.join(driven)}: name the "
-            "joints that have an input, as driven_joints=[...]"
+            "joints that have an input by driven_joints=[...]"
         )
     return driven
 

@@ -35,15 +35,15 @@ class KnownAndNetwork(Sum):
 
         (M_k + M_n) a + (C_k + C_n) v + G_k + G_n + (D_k + D_n) v + F_k + F_n = A_k u + r
 
-    Known terms have the index k, terms of the network n. The network has no input matrix
-    (``input: none``) and small initial terms. With the typical torques f of the drives::
+    Known terms have the index k, terms of the network the index n. The network has no input matrix
+    (``input: none``), and its initial terms are small. With the typical torques f of the drives::
 
         penalty = w mean over the batch and i of (tau_i / f_i)^2
         tau = M_n a + C_n v + G_n + D_n v + F_n
 
     Args:
         statistics: scales of the data.
-        known, network: builders of the parts; by default, the terms of the network start small.
+        known, network: builders of the parts. The default network has small initial terms.
         residual: builder of the residual force.
         weight: w.
         integrator: the integration method.
@@ -62,7 +62,7 @@ class KnownAndNetwork(Sum):
         integrator: Integrator | None = None,
     ):
         first = known(statistics=statistics)
-        # The network computes forces, so its scales are those of torques instead of currents.
+        # The network computes forces. Its scales are those of torques, not of currents.
         force = first.typical_force[first.driven].to(statistics.u_mean)
         force = force.repeat(statistics.num_inputs // max(len(force), 1))
         forces = replace(statistics, u_mean=0 * force, u_std=force)
@@ -74,7 +74,7 @@ class KnownAndNetwork(Sum):
             ("initial_velocity", second.learns_initial_state),
         ):
             if present:
-                raise ValueError(f"network.{head} is a head that a sum does not use: remove it")
+                raise ValueError(f"network.{head} is a head without an effect in a sum: remove it")
         super().__init__({"known": first, "network": second}, integrator)
         self.weight = weight
         force = first.typical_force
@@ -86,7 +86,7 @@ class KnownAndNetwork(Sum):
 
     @property
     def known(self) -> KnownMechanics:
-        """Known part."""
+        """Known part of the sum."""
         part = self.parts["known"]
         assert isinstance(part, KnownMechanics)
         return part

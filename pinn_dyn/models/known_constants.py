@@ -1,4 +1,4 @@
-"""Learned physical constants, as functions of parameters z that are standard normal a priori."""
+"""Learned physical constants as functions of parameters z with a standard normal prior."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 
 class Named(NamedTuple):
-    """Constants in physical units. A drive gain has the unit of its force by u, such as Nm/u.
+    """Constants in physical units. The unit of a drive gain is that of the force per u: Nm/u.
 
-    Data give only an upper limit of the values if ``upper_limit`` is true.
+    If ``upper_limit`` is true, data give only an upper limit of the values.
     """
 
     names: list[str]
@@ -26,10 +26,10 @@ class Named(NamedTuple):
 
 
 class Constants(nn.Module, abc.ABC):
-    """Constants of one kind, made from the parameters ``z``.
+    """Constants of one kind, computed from the parameters ``z``.
 
     Attributes:
-        names, units: meaning and unit of each entry of z, flattened.
+        names, units: meaning and unit of each entry of the flattened z.
         lower: lower limit of the constants.
     """
 
@@ -50,10 +50,10 @@ class Constants(nn.Module, abc.ABC):
 
 
 class HasConstants(nn.Module):
-    """Part of a model that lists the constants inside it."""
+    """Part of a model that lists its constants."""
 
     def physical_constants(self) -> list[Named]:
-        """Return all constants in physical units, and other parameters by their attributes."""
+        """Return all constants in physical units, and all other parameters by attribute name."""
         constants: list[Named] = []
         for path, module in self.named_modules():
             if isinstance(module, Constants):
@@ -66,7 +66,7 @@ class HasConstants(nn.Module):
 
 
 class PositiveConstants(Constants):
-    """Log-normal constants start exp(spread z) + floor. z is zero at the start.
+    """Log-normal constants start exp(spread z) + floor. The initial z is zero.
 
     Args:
         start: prior median, ``(n,)``.
@@ -141,7 +141,7 @@ class RealConstants(Constants):
 
 
 class PhysicalBodies(Constants):
-    """Pseudo-inertias of n bodies. For every z each body has a positive density::
+    """Pseudo-inertias of n bodies. Each body has a positive density for all z::
 
         J = B U U^T B^T,    J_start = B B^T,    B = sqrt(m) [[S^(1/2), c], [0, 1]]
 
@@ -150,9 +150,9 @@ class PhysicalBodies(Constants):
               | 0     0     e^d3  t3 |
               | 0     0     0     1  |
 
-    m, c and S are the mass, the centre of mass and the covariance of the mass at the start. Source:
-    Rucker and Wensing (2022), "Smooth parameterization of rigid-body inertia", eq. (9), here
-    relative to a start.
+    m, c and S are the mass, the center of mass and the covariance of the mass of the initial body.
+    Source: Rucker and Wensing (2022), "Smooth parameterization of rigid-body inertia", eq. (9),
+    here relative to an initial body.
 
     Args:
         start: pseudo-inertias of bodies of positive density, ``(n, 4, 4)``, kg, kg m, kg m^2.
@@ -194,7 +194,7 @@ class PhysicalBodies(Constants):
         return self.inertia_of(self.z)
 
     def inertia_of(self, z: Tensor) -> Tensor:
-        """Return J of other parameters z, as :meth:`forward`."""
+        """Return J for the parameters z, with the shapes of :meth:`forward`."""
         a, d1, d2, d3, s12, s13, s23, t1, t2, t3 = (self.spread * z).unbind(-1)
         zero, unit = torch.zeros_like(a), torch.ones_like(a)
         rows = [
@@ -208,9 +208,9 @@ class PhysicalBodies(Constants):
         return root @ root.mT
 
     def parameters_of(self, inertia: Tensor) -> Tensor:
-        """Return the z of pseudo-inertias of positive density, ``(*batch, n, 10)``; else NaN."""
+        """Return z of pseudo-inertias, ``(*batch, n, 10)``; NaN without a positive density."""
         whitened = torch.linalg.solve(self.root, torch.linalg.solve(self.root, inertia).mT)
-        # An upper Cholesky factor is a lower one of the matrix with its rows and columns reversed.
+        # Reversed rows and columns turn the lower Cholesky factor into an upper factor.
         factor, failed = torch.linalg.cholesky_ex(whitened.flip(-2, -1))
         stretch = torch.where(failed[..., None, None] == 0, factor, torch.nan).flip(-2, -1)
         scale = stretch[..., 3, 3]

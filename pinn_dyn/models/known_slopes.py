@@ -1,4 +1,4 @@
-"""Closed formulas for the derivatives of the force of known mechanics."""
+"""Closed-form derivatives of the force of known mechanics."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ _BODIES = "model.bodies.z"
 
 
 class KnownSlopes(Slopes):
-    """Derivatives of :class:`~.known.KnownMechanics` by the regressor Y of its bodies::
+    """Derivatives of :class:`~.known.KnownMechanics` with the regressor Y of its bodies::
 
         e = Y(q, v, a) pi(z) + drive force(q, v, a, u; z)
         de/dz = Y dpi/dz + d(drive force)/dz
 
-    One reverse pass through all drives, with copies of the constants, gives the second term.
+    A single reverse pass through all drives, with a copy of the constants for each sample, gives
+    the second term.
     """
 
     def __init__(self, model: LearnedConstants):
@@ -32,7 +33,7 @@ class KnownSlopes(Slopes):
 
     def by_regressor(self, regressor: Tensor, *at: Tensor) -> Tensor:
         def elements(m: Any) -> Tensor:
-            """Return the forces of all drives, and then of all springs, ``(*batch, N + S)``."""
+            """Return the forces of all drives, followed by all springs, ``(*batch, N + S)``."""
             force = m.drive_force(*at)
             return force if m.elastic is None else torch.cat([force, m.elastic.forces(*at[:2])], -1)
 
@@ -68,7 +69,10 @@ class KnownSlopes(Slopes):
         return torch.block_diag(*slopes.movedim(0, 1))
 
     def _drive_slopes(self, function: Callable[[Any], Tensor], like: Tensor) -> Tensor:
-        """Return d function_i / dz, ``(*batch, N, P - 10 n)``, for values shaped like ``like``."""
+        """Return d function_i / dz, ``(*batch, N, P - 10 n)``, without parameters of the n bodies.
+
+        The function of the model returns a tensor with the shape of ``like``.
+        """
         called = Called(self.model, function)
         values = {
             name: z.detach().expand(*like.shape[:-1], -1).clone().requires_grad_()
@@ -78,25 +82,24 @@ class KnownSlopes(Slopes):
         with torch.enable_grad():
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
-        # Constants of drives have an entry for each driven joint instead of each joint.
+        # Constants of drives have an entry per driven joint, not per joint.
         sides = dict.fromkeys(("armature", "drives"), self.model.motors)
         sides["offset"] = self.model.offset_joints
         if self.model.springs is not None:
             sides["springs"] = self.model.springs.selection
         if self.model.elastic is not None:
             sides["elastic"] = self.model.elastic.stretch
-        parts = [name.split(".")[1] for name in values]
-        return torch.cat(
-            [
-                sides[part].mT * slope.unsqueeze(-2) if part in sides else torch.diag_embed(slope)
-                for part, slope in zip(parts, slopes, strict=True)
-            ],
-            dim=-1,
-        )
+        blocks = []
+        for name, slope in zip(values, slopes, strict=True):
+            side = sides.get(name.split(".")[1])
+            blocks.append(
+                torch.diag_embed(slope) if side is None else side.mT * slope[..., None, :]
+            )
+        return torch.cat(blocks, dim=-1)
 
 
 class KnownSamples(Samples):
-    """Samples whose regressor Y is computed once, since Y does not depend on the parameters."""
+    """Samples with a regressor Y that is computed once; Y does not depend on the parameters."""
 
     def __init__(self, model: LearnedConstants, q: Tensor, v: Tensor, a: Tensor, u: Tensor):
         super().__init__(model, q, v, a, u)

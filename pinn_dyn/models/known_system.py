@@ -22,7 +22,7 @@ def _term(system: MechanicalSystem, name: str, *values: Tensor) -> Tensor:
 
 
 def _of_structure(name: str) -> Callable[..., Any]:
-    """Build a method that calls the structure with the learned constants as its buffers."""
+    """Build a method that calls the structure with the learned constants in its buffers."""
 
     def method(self: KnownSystem, *values: Tensor) -> Any:
         learned = {f"model.{key}": part().view(self.shapes[key]) for key, part in self.parts()}
@@ -34,20 +34,20 @@ def _of_structure(name: str) -> Callable[..., Any]:
 class KnownSystem(LearnedConstants):
     """Mechanical system with known terms and learned constants c::
 
-        c_i = start_i exp(spread z_i) > 0,      z_i standard normal a priori
+        c_i = start_i exp(spread z_i) > 0,      z_i ~ N(0, 1)
 
     Args:
         statistics: scales of the data.
-        structure: a system such as :class:`~pinn_dyn.systems.SoftArm`, whose attribute
-            ``constants`` has the units of each buffer to fit, as in ``{"mass": ["kg"]}``. The
-            buffers are the initial guesses.
+        structure: a system such as :class:`~pinn_dyn.systems.SoftArm`. Its attribute ``constants``
+            has the units of each buffer to fit, as in ``{"mass": ["kg"]}``. The buffers are the
+            initial guesses.
         spread: prior standard deviation of log c: 1.5 if a guess may be off by a factor of ten,
             0.3 for a data sheet.
         integrator: the integration method.
 
     Raises:
-        ValueError: if the coordinates or inputs are not those of the data, or if the constants are
-            not positive buffers with units.
+        ValueError: if the coordinates or inputs do not match the data, or the constants are not
+            positive buffers with units.
     """
 
     def __init__(

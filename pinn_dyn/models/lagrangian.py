@@ -22,8 +22,8 @@ from pinn_dyn.models.statistics import Statistics
 class LagrangianNetwork(structured.StructuredNetwork):
     """Lagrangian network with dissipation and a learned input matrix.
 
-    The acceleration follows from paper eq. (armdynamics), which for L(q, v) = v^T M v / 2 - V
-    reads, with a friction F and a residual force r::
+    The acceleration follows from paper eq. (armdynamics). For L(q, v) = v^T M v / 2 - V, with
+    friction F and a residual force r::
 
         M a = A u + r - D v - F(v) - G - (dM/dt) v + d(v^T M v / 2)/dq
 
@@ -97,7 +97,7 @@ class LagrangianNetwork(structured.StructuredNetwork):
         return self._energy_gradient(tape, v, matvec(self._root(factor), v))
 
     def _factor_and_coriolis_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Return L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq; M = R^T R, dR along v."""
+        """Return L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq with M = R^T R, dR along v."""
         if self.mass.constant:
             return self.mass(q), torch.zeros_like(q)
         factor, factor_rate, tape = self.mass.linearize_along(q, v)
@@ -108,7 +108,7 @@ class LagrangianNetwork(structured.StructuredNetwork):
         return factor, mass_rate_v - self._energy_gradient(tape, v, w)
 
     def _root(self, factor: Tensor) -> Tensor:
-        """Return R with M = R^T R: L^T, or L with a transposed head."""
+        """Return R with M = R^T R: R = L^T, or R = L for a transposed head."""
         return factor if self.mass.transposed else factor.transpose(-1, -2)
 
     def _energy_gradient(self, tape: Tape, v: Tensor, w: Tensor) -> Tensor:

@@ -21,26 +21,30 @@ class LearnedConstants(HasConstants, MechanicalSystem):
 
         e(q, v, a, u; z) = M a + C v + G + D v + F - A u - r = 0
 
-    e is the missing force. z ``(P,)`` are the parameters in the order of ``parameters()``. All
-    methods below follow from the terms. A subclass with closed formulas may override them.
+    e is the missing force. z ``(P,)`` are the parameters in the order of ``parameters()``. The
+    methods of this class use the terms of the system. A subclass may override them by closed
+    formulas.
     """
 
     @property
     def has_passive_joints(self) -> bool:
-        """True if coordinates have no input, so that no bodies explain their equation."""
+        """True if coordinates have no input; zero inertia would fit their equation."""
         return self.num_inputs < self.num_coordinates
 
     @property
     def identified_by_forces(self) -> bool:
-        """True if the force of a filtered input is that of the input, filtered."""
+        """True if filtering the input has the same effect as filtering the force."""
         return self.input_affine
 
     def saturated(self, v: Tensor, u: Tensor) -> Tensor:
-        """Return where drives do not reach the force of their command, ``(*batch, N)``, bool."""
+        """Return true where a drive does not reach its command, ``(*batch, N)``, bool."""
         return torch.zeros_like(v, dtype=torch.bool)
 
     def absent_parameters(self) -> Tensor | None:
-        """Return z ``(P,)`` at which an optional effect is absent, NaN for all other parameters."""
+        """Return z ``(P,)`` that switches optional effects off, or None without such effects.
+
+        Entries are NaN for all other parameters.
+        """
         return None
 
     def parameter_names(self) -> list[str]:
@@ -48,7 +52,7 @@ class LearnedConstants(HasConstants, MechanicalSystem):
         return [name for part in HasConstants.physical_constants(self) for name in part.names]
 
     def drive_gain(self) -> Tensor:
-        """Return the gain k ``(N,)`` of each input: 1, unless gains are learned."""
+        """Return the gain k of each coordinate's input, ``(N,)``; 1 if no gains are learned."""
         return torch.ones(self.num_coordinates, dtype=next(self.parameters()).dtype)
 
     def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
@@ -56,26 +60,29 @@ class LearnedConstants(HasConstants, MechanicalSystem):
         return self.applied_force(q, v, u)
 
     def missing_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return e, ``(*batch, N)``, the force that the input lacks for the acceleration."""
+        """Return e, ``(*batch, N)``, the required force minus the force of the input."""
         return self.inverse_dynamics(q, v, a) - self.applied_force(q, v, u)
 
     def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return the spread of motor force / k over samples, ``(N,)``, or else of M a / k."""
+        """Return the standard deviation of motor force / k over samples, ``(N,)``.
+
+        For a coordinate without a motor force, return that of M a / k.
+        """
         driven = (self.motor_force(q, v, u) / self.drive_gain()).std(0)
         inertial = (matvec(self.mass_matrix(q), a) / self.drive_gain()).std(0)
         scale = torch.where(driven > 1e-9 * inertial, driven, inertial)
-        return torch.where(scale > 0, scale, 1.0)  # no scale for a joint at rest
+        return torch.where(scale > 0, scale, 1.0)  # a joint at rest has no scale
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
-        """Return fitted over initial force of each input ``(M,)``, and its largest likely value."""
+        """Return the ratio of fitted to initial force per input, ``(M,)``, and a likely limit."""
         return torch.ones(self.num_inputs), math.inf
 
     def slopes(self) -> Slopes:
-        """Return the derivatives of e at the present z."""
+        """Return the derivatives of e at the current z."""
         return Slopes(self)
 
     def samples(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Samples:
-        """Return e as a function of z at fixed samples of motion, ``(K, N)`` and ``(K, M)``."""
+        """Return e at K fixed samples of motion, ``(K, N)`` and ``(K, M)``, for changing z."""
         return Samples(self, q, v, a, u)
 
 
@@ -88,7 +95,8 @@ class Slopes:
     def by_parameters(self, *at: Tensor) -> Tensor:
         """Return de/dz, ``(B, N, P)``, from samples q, v, a ``(B, N)`` and u ``(B, M)``.
 
-        After them, a sticking law takes the share of forward motion (:class:`~.sliding.Sliding`).
+        A sticking law takes the share of forward motion as another sample
+        (:class:`~.sliding.Sliding`).
         """
         function, z = self._of_parameters(lambda model, *sample: model.missing_force(*sample))
         return vmap(jacrev(function), in_dims=(None, *(0 for _ in at)))(z, *at)
@@ -105,7 +113,7 @@ class Slopes:
     def _of_parameters(
         self, function: Callable[..., Tensor]
     ) -> tuple[Callable[..., Tensor], Tensor]:
-        """Convert a function of the model to a function of z ``(P,)``; return it and z."""
+        """Return a function of the model as a function of z ``(P,)``, and the current z."""
         called = Called(self.model, function)
         names, values = zip(*called.named_parameters(), strict=True)
 
@@ -118,7 +126,7 @@ class Slopes:
 
 
 class Samples:
-    """Missing force e at K fixed samples of motion, for the present z of the model."""
+    """Missing force e at K fixed samples of motion, for the current z of the model."""
 
     def __init__(self, model: LearnedConstants, *at: Tensor):
         self.model: Any = model
@@ -134,7 +142,7 @@ class Samples:
 
 
 class Called(nn.Module):
-    """A function of a model as the forward pass of a module."""
+    """Module whose forward pass is a function of a model."""
 
     def __init__(self, model: nn.Module, function: Callable[..., Tensor]):
         super().__init__()

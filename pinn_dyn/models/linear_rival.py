@@ -1,4 +1,4 @@
-"""Linear baselines, ARX and EDMDc, fitted by ridge regression in a fraction of a second."""
+"""Linear baselines ARX and EDMDc, fitted by ridge regression in a fraction of a second."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class LinearRival(Predictor):
         s_k     = (x_k, x_{k-1}, ... x_{k-L+1}, u_{k-1}, ... u_{k-L+1})
 
     L is the number of lags. phi(s) is s for degree 1, and s with all products of two entries for
-    degree 2. u_{k+1} is the left value of the input at the end of the step.
+    degree 2. u_{k+1} is the input at the end of the step, before a jump.
 
     The state history before the start of a rollout is estimated from (x_0, u_0) by a linear map
-    fitted on the training windows, so the baseline uses the same measurements as a network.
+    fitted on the training windows. The baseline thus uses the same measurements as a network.
 
     Sources: Ljung (1999), "System Identification", section 4.2 (ARX); Korda and Mezic (2018),
     "Linear predictors for nonlinear dynamical systems" (EDMDc), projected onto the state after
@@ -67,7 +67,7 @@ class LinearRival(Predictor):
         self.lags, self.degree = lags, degree
         state, ends, target = _windows(train, step, lags)
         if degree == 2 and state.shape[1] ** 2 > 2 * _FEATURES:
-            raise ValueError(f"more than {_FEATURES} products of past states: expected fewer lags")
+            raise ValueError(f"more than {_FEATURES} products of past states: use fewer lags")
         self.register_buffer("mean", state.mean(0))
         self.register_buffer("scale", _spread(state))
         features = torch.cat([self._lift(state), ends], dim=1)
@@ -82,7 +82,7 @@ class LinearRival(Predictor):
             self.register_buffer(f"{prefix}bias", fit[1])
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Apply the linear map step by step, of which ``t`` must have the length."""
+        """Apply the linear map step by step. The spacing of ``t`` must be the step."""
         self._require_step(t)
         # A held input has the same value at both ends of a step.
         ends = input.stages(t, (0.0, 1.0)).to(x0)
@@ -118,7 +118,11 @@ def fit_linear_rival(
     step: float,
     degree: Literal[1, 2],
 ) -> LinearRival:
-    """Fit the baseline of the smallest mean |q_hat - q| on validation, or raise ValueError."""
+    """Fit baselines and return that with the smallest mean |q_hat - q| on validation.
+
+    Raises:
+        ValueError: if no baseline can be fitted.
+    """
     truth = stack_until(validation)
     stride = samples_of("step", step, truth.t)
     truth = truth.until(min(truth.duration, step * _STEPS))
@@ -135,20 +139,20 @@ def fit_linear_rival(
             truth.t[::stride].double(),
             truth.input.to(truth.q.device, torch.float64),
         )
-        off = x[..., : rival.num_coordinates] - truth.q[:, ::stride]
-        rivals.append((float(off.norm(dim=-1).mean().nan_to_num(torch.inf, torch.inf)), rival))
+        error = (x[..., : rival.num_coordinates] - truth.q[:, ::stride]).norm(dim=-1).mean()
+        rivals.append((float(error.nan_to_num(torch.inf, torch.inf)), rival))
     if not rivals:
         raise ValueError(f"no linear model can be fitted: {reason}")
     return min(rivals, key=lambda item: item[0])[1]
 
 
 def _windows(train: Sequence[Trajectory], step: float, lags: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return states s, inputs (u_k, u_{k+1}) and increments x_{k+1} - x_k, a row per window."""
+    """Return states s, inputs (u_k, u_{k+1}) and increments x_{k+1} - x_k, one row per window."""
     strides = [samples_of("step", step, item.t) for item in train]
     counts = [len(item.t) - lags * k for item, k in zip(train, strides, strict=True)]
     total = sum(max(count, 0) for count in counts)
     if total < 2:
-        raise ValueError(f"no training trajectory is as long as {lags} steps of {step:g} s")
+        raise ValueError(f"all training trajectories are shorter than {lags} steps of {step:g} s")
     thin = -(-total // _ROWS)
     parts = []
     for item, stride, count in zip(train, strides, counts, strict=True):
@@ -167,7 +171,7 @@ def _ridge(features: Tensor, target: Tensor, ridge: float) -> tuple[Tensor, Tens
     """Return W and b that minimize mean |y - z W - b|^2 + ridge |W s|^2, s the spread of z."""
     centre, scale = features.mean(0), _spread(features)
     z, mean = (features - centre) / scale, target.mean(0)
-    # A Gram matrix would lose precision.
+    # Use QR, since a Gram matrix would lose precision.
     rows = torch.linalg.qr(torch.cat([z, target - mean], dim=1), mode="r").R[: z.shape[1]]
     left, size, right = torch.linalg.svd(rows[:, : z.shape[1]], full_matrices=False)
     shrunk = size / (size.square() + ridge * len(z))

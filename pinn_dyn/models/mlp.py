@@ -1,4 +1,4 @@
-"""A multilayer perceptron with explicit tangent and reverse passes."""
+"""Multilayer perceptron with explicit tangent and reverse passes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 Tape = tuple[Tensor, ...]
-"""Slopes of the features and hidden activations."""
+"""Slopes of the features and of the hidden activations, for the reverse pass."""
 
 
 def _softplus(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -30,34 +30,35 @@ def _silu(z: Tensor) -> tuple[Tensor, Tensor]:
 
 
 Activation = Literal["softplus", "tanh", "silu"]
-"""Name of a smooth activation. Equations of motion need two derivatives, so ReLU is missing."""
+"""Name of a smooth activation. ReLU is excluded, since training needs two derivatives."""
 
 ACTIVATIONS: dict[Activation, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
     "softplus": _softplus,
     "tanh": _tanh,
     "silu": _silu,
 }
-"""Functions that return value and slope of each activation."""
+"""Functions that return the value and slope of each activation."""
 
 
 class MLP(nn.Module):
     """y = W_n s(... s(W_1 z + b_1) ...) + b_n, with z = (x - mean)/std.
 
-    The features of an angle x_i are sin(x_i) and cos(x_i). With ``limits`` the features of all
+    The features of an angle x_i are sin(x_i) and cos(x_i). With ``limits``, the features of all
     other entries are z = (c - mean)/std + tanh((x - c)/std), with c = x clipped to its limits. They
     are at most one standard deviation beyond the limits, and twice continuously differentiable.
 
-    With ``after`` the output y_o depends only on the entries x_i with i > after_o, by masked
-    weights W_k (Germain et al. 2015, "MADE").
+    With ``after``, masked weights W_k make the output y_o depend only on the entries x_i with
+    i > after_o (Germain et al. 2015, "MADE").
 
-    :meth:`linearize_along` returns y and J dx, :meth:`pullback` J^T dy. Both are differentiable.
+    With J = dy/dx, :meth:`linearize_along` returns y and J dx, and :meth:`pullback` returns J^T dy.
+    Both are differentiable.
 
     Args:
         inputs, outputs: sizes of x and y.
         hidden, activation: widths and activation of the hidden layers.
         mean, std: normalization of x, ``(inputs,)``. The default is no normalization.
         angles: positions of the angles in x.
-        after: position for each output. The default lets all outputs depend on all of x.
+        after: a position per output, see above. By default, all outputs depend on all inputs.
         limits: smallest and largest x in the data, ``(inputs,)`` each. The default is no limits.
 
     Raises:
@@ -108,8 +109,9 @@ class MLP(nn.Module):
 
     def _mask(self, inputs: int, after: Sequence[int]) -> None:
         """Register masks for the weights, and scale the initial weights to compensate."""
-        first = torch.arange(inputs).repeat(2 if self._has_angles else 1)  # entry read by each unit
-        # The number of units that read from x_i on is proportional to the number of these entries.
+        # Each unit reads the entries of x from a first entry on. The number of units with the first
+        # entry x_i is proportional to the number of entries from x_i on.
+        first = torch.arange(inputs).repeat(2 if self._has_angles else 1)
         share = torch.arange(inputs - 1, 0, -1).cumsum(0).double()
         masks = []
         for layer in self.linears[:-1]:
@@ -173,7 +175,7 @@ class MLP(nn.Module):
         *hidden, last = (weight for weight, _ in self._layers())
         first, *slopes = tape
         h = columns(dy)
-        # Inductor (torch 2.13) compiles ones(B, 1) @ W to a wrong gradient at some small sizes.
+        # Avoid ones(B, 1) @ W, for which Inductor (torch 2.13) compiles a wrong gradient.
         h = last.T * h if last.shape[0] == 1 else last.T @ h
         for weight, slope in zip(reversed(hidden), reversed(slopes), strict=True):
             h = weight.T @ (h * slope)
@@ -194,7 +196,7 @@ class MLP(nn.Module):
             z, slope = (clipped - mean) / std + beyond, (1 - beyond * beyond) / std
         if not self._has_angles:
             return z, slope
-        # Twice as many features as entries, without indexing: z or sin(x), and 0 or cos(x).
+        # Without indexing, each entry has two features: z or sin(x), and 0 or cos(x).
         is_angle, zero = self.is_angle[:, None], torch.zeros_like(x)
         sine, cosine = torch.sin(x), torch.cos(x)
         features = [torch.where(is_angle, sine, z), torch.where(is_angle, cosine, zero)]
@@ -209,7 +211,7 @@ def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor
 
 
 def columns(x: Tensor) -> Tensor:
-    """Return ``(*batch, n)`` as a view ``(n, B)``, so that operations run along the batch."""
+    """Return ``(*batch, n)`` as a view ``(n, B)``, for operations along the batch."""
     return x.reshape(-1, x.shape[-1]).T
 
 

@@ -13,18 +13,18 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Modes:
-    r"""Modes of x_{k+1} = A x_k + B u_k, q_k = C x_k, the strongest first.
+    r"""Modes of x_{k+1} = A x_k + B u_k, q_k = C x_k, in the order of decreasing strength.
 
-    An eigenvalue e of A belongs to the pole s = log(e) / h with the step h. A pair of conjugate
-    poles is one mode. A mode without oscillation has the damping ratio 1.
+    An eigenvalue e of A corresponds to the pole s = log(e) / h with the step h. A pair of conjugate
+    poles is a single mode. A mode without oscillation has the damping ratio 1.
 
     Attributes:
         frequency: \|s\| / (2 pi), ``(P,)``, Hz.
         damping: damping ratio, -Re(s) / \|s\|, ``(P,)``.
         shapes: C times the eigenvectors, ``(P, N)``, complex, in the units of q. The largest entry
             in relation to the spread is real, and has the size of the spread.
-        share: standard deviation of q due to the mode alone under white noise at the inputs, in
-            relation to the strongest mode, ``(P,)``.
+        share: standard deviation of q due to a single mode under white noise at the inputs,
+            relative to the strongest mode, ``(P,)``.
         spread: standard deviations of q in the training data, ``(N,)``.
     """
 
@@ -36,11 +36,11 @@ class Modes:
 
     @property
     def relative_shapes(self) -> Tensor:
-        """Real parts of the shapes in relation to the spreads, ``(P, N)``, between -1 and 1."""
+        """Real parts of the shapes relative to the spreads, ``(P, N)``, between -1 and 1."""
         return self.shapes.real / self.spread
 
     def to_frame(self, labels: Sequence[str] | None = None) -> pd.DataFrame:
-        """Return one row per mode, with amplitude and phase of its shape in each coordinate."""
+        """Return a table with a row per mode: amplitude and phase of the shape per coordinate."""
         names = list(labels or (f"q{k + 1}" for k in range(len(self.spread))))
         columns = {
             "frequency_Hz": self.frequency,
@@ -67,20 +67,20 @@ def modes_of(A: Tensor, B: Tensor, C: Tensor, *, step: float, spread: Tensor) ->
     excitation = torch.linalg.solve(vectors, B.to(vectors))
     shapes = (C.to(vectors) @ vectors).T
     relative = shapes / spread
-    # q is 2 Re(impulses e^k) after k steps, or half of it for a real eigenvalue.
+    # After k steps, q is 2 Re(impulses e^k) for a complex pair, and half of it for a real e.
     impulses = relative.unsqueeze(-1) * excitation.unsqueeze(-2)
     power, square = impulses.abs().square().sum((1, 2)), impulses.square().sum((1, 2))
     variance = 2 * power / (1 - eigenvalues.abs().square())
     variance = variance + 2 * (square / (1 - eigenvalues.square())).real
     share = (variance / torch.where(eigenvalues.imag == 0, 4.0, 1.0)).clamp(min=0).sqrt()
     largest = relative.gather(1, relative.abs().argmax(dim=1, keepdim=True))
-    kept = (eigenvalues.imag >= 0).nonzero()[:, 0]
-    kept = kept[share[kept].argsort(descending=True)]
-    poles = eigenvalues[kept].log() / step
+    order = (eigenvalues.imag >= 0).nonzero()[:, 0]
+    order = order[share[order].argsort(descending=True)]
+    poles = eigenvalues[order].log() / step
     return Modes(
         frequency=poles.abs() / (2 * math.pi),
         damping=-poles.real / poles.abs(),
-        shapes=(shapes / largest)[kept],
-        share=share[kept] / share[kept].max(),
+        shapes=(shapes / largest)[order],
+        share=share[order] / share[order].max(),
         spread=spread,
     )

@@ -28,8 +28,8 @@ class Potential(nn.Module, abc.ABC):
 class NetworkPotential(Potential):
     """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
 
-    K = S S^T is a learned constant. z has zeros for angles. The input of the network saturates
-    outside the data, so that V is bounded from below.
+    K = S S^T is a learned constant matrix. z is zero for angles. The input of the network saturates
+    outside the data. V is therefore bounded from below.
 
     Args:
         scales: scales of the data. The value is a typical energy, J.
@@ -84,8 +84,8 @@ class ChainPotential(Potential):
         V = scale * e^T w_1,    w_k = (T_k + S_k sin q_k + C_k cos q_k) w_k+1 + h_k
 
     with w_N+1 = h_N+1, and learned T, S, C, h and e. Joints are ordered from base to tip. In a
-    chain of rigid bodies w_k is the first moment of mass of the bodies from joint k to the tip, in
-    the frame before joint k. Three rows represent it exactly; more rows are easier to train.
+    chain of rigid bodies, w_k is the first moment of mass of the bodies from joint k to the tip, in
+    the frame before joint k. Three rows represent w_k exactly; more rows are easier to train.
 
     Args:
         scales: scales of the data. The value is a typical energy, J.
@@ -107,7 +107,9 @@ class ChainPotential(Potential):
             )
         self.rank = rank
 
-        normal = lambda *shape: nn.Parameter(torch.randn(shape) / rank**0.5)  # noqa: E731
+        def normal(*shape: int) -> nn.Parameter:
+            return nn.Parameter(torch.randn(shape) / rank**0.5)
+
         self.turns = nn.ParameterList(normal(3 * rank, rank) for _ in range(size))
         self.offsets = nn.ParameterList(normal(rank, 1) for _ in range(size + 1))
         self.base = normal(rank, 1)

@@ -1,4 +1,4 @@
-"""The head for a residual force, a network of q, v and u."""
+"""Head for a residual force: a network of q, v and u."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ class NetworkResidual(nn.Module):
 
         penalty = w mean over the batch and i of (r_i / f_i)^2
 
-    f is a typical generalized force. r is initially zero. It is not passive, but bounded: the input
-    of the network saturates outside the range of q, and three standard deviations of v and u.
+    f is a typical generalized force. r is initially zero. r is not passive, but bounded: the input
+    of the network saturates outside the range of q, and beyond three standard deviations of v and
+    u.
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
         hidden, activation: widths and activation of the hidden layers.
-        weight: w. The initial loss of the prediction is near one.
+        weight: w, in relation to the loss of the prediction, which is near one at the start.
     """
 
     scale: Tensor
@@ -53,7 +54,7 @@ class NetworkResidual(nn.Module):
         return self.scale * self.network.linearize(torch.cat([q, v, u], dim=-1))[0]
 
     def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return the penalty of r at states ``(B, N)`` and inputs ``(B, M)``, a scalar."""
+        """Return the penalty of r, a scalar, at states ``(B, N)`` and inputs ``(B, M)``."""
         return self.weight * (self(q, v, u) / self.scale).square().mean()
 
 

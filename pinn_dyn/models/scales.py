@@ -1,4 +1,4 @@
-"""Scales of the data that a head is built on."""
+"""Scales of the data for the normalization of heads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pinn_dyn.models.statistics import Statistics
 
 @dataclass(frozen=True)
 class Joint:
-    """Name of a joint, and units along it, depending on whether it turns or slides."""
+    """Name of a joint, and units of its quantities for a turning or sliding joint."""
 
     name: str
     turns: bool = True
@@ -35,6 +35,11 @@ class Joint:
         return "kg m^2" if self.turns else "kg"
 
     @property
+    def stiffness(self) -> str:
+        """Unit of a stiffness."""
+        return "Nm/rad" if self.turns else "N/m"
+
+    @property
     def damping(self) -> str:
         """Unit of viscous friction."""
         return "Nms/rad" if self.turns else "Ns/m"
@@ -42,14 +47,14 @@ class Joint:
 
 @dataclass(frozen=True)
 class Scales:
-    """Scales that a head is built on, so that its network works on numbers near one.
+    """Scales by which a head normalizes the inputs and outputs of its network.
 
     Attributes:
         statistics: means and standard deviations of q, v and u, in SI units.
-        value: typical size of the output of the head, in the shape that its docstring states.
-        angles: coordinates that are angles and enter a network as sine and cosine.
-        named: the joint of each coordinate, if the model knows it.
-        prior: true if learned constants need a standard normal prior, for a least-squares fit.
+        value: typical size of the output of the head. The docstring of the head gives the shape.
+        angles: coordinates that are angles. Networks use their sine and cosine.
+        named: the joint of each coordinate, or None if the model does not know the joints.
+        prior: true if learned constants have a standard normal prior, for a least-squares fit.
     """
 
     statistics: Statistics
@@ -60,19 +65,19 @@ class Scales:
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """The joint of each coordinate. Unnamed joints are numbered."""
+        """Joint of each coordinate. Unnamed joints are numbered."""
         if self.named is not None:
             return self.named
         return tuple(Joint(f"joint {k + 1}") for k in range(self.size))
 
     @property
     def size(self) -> int:
-        """N."""
+        """Number of coordinates N."""
         return self.statistics.num_coordinates
 
     @property
     def inputs(self) -> int:
-        """M."""
+        """Number of inputs M."""
         return self.statistics.num_inputs
 
     def positive(
@@ -84,7 +89,7 @@ class Scales:
         units: Sequence[str],
         floor: float = 0.0,
     ) -> Constants:
-        """Build a learned positive constant of each joint, named "<label> of <joint>".
+        """Build learned positive constants, one per joint, named "<label> of <joint>".
 
         Args:
             label: meaning of the constant.
@@ -92,7 +97,7 @@ class Scales:
             scale: typical size, ``(N,)``.
             spread: prior standard deviation of the logarithm.
             units: N units.
-            floor: lower limit in units of the scale, or of the mean scale with a prior.
+            floor: lower limit in units of the scale, or of the mean scale if ``prior`` is true.
         """
         names = [f"{label} of {joint.name}" for joint in self.joints]
         if self.prior:
@@ -108,7 +113,7 @@ class Scales:
         activation: Activation,
         after: Sequence[int] | None = None,
     ) -> MLP:
-        """Build a network of q. Its input saturates outside the data, see :class:`MLP`."""
+        """Build a network of q whose input saturates outside the data, see :class:`MLP`."""
         data = self.statistics
         normal, limits = (data.q_mean, data.q_std), (data.q_low, data.q_high)
         return MLP(self.size, outputs, hidden, activation, *normal, self.angles, after, limits)

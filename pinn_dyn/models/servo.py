@@ -1,4 +1,4 @@
-"""Position servos, whose input is a target instead of a force."""
+"""Position servos, which take a target position instead of a force as input."""
 
 from __future__ import annotations
 
@@ -27,18 +27,19 @@ class Servo(Drives):
 
         s = k (u - q) - d v + f,      tau = s / (1 + |s / L|^8)^(1/8)
 
-    Without a limit L, tau = s. The spring is a part of the potential, V + k q^2 / 2, and d of the
-    damping matrix, so that a model with a servo is passive at a constant target. The input matrix
-    is A = k, or (k, 1) with feed-forward forces, and A^-1 gives the target of a force exactly.
-    Without a limit, d is zero, because the damping of the joint contains it.
+    Without a limit L, tau = s. The spring is a part of the potential, V + k q^2 / 2, and d is a
+    part of the damping matrix. A model with a servo is therefore passive at a constant target. The
+    input matrix is A = k, or (k, 1) with feed-forward forces, and A^-1 gives the target for a force
+    exactly. Without a limit, d is zero, because the damping of the joint includes it.
 
-    k ``(n,)`` is in Nm/rad or N/m, d in Nms/rad or Ns/m, L in Nm or N. All forces of a model with a
-    learned k share an unknown factor. A fixed k, known bodies or a feed-forward force determine it.
+    k ``(n,)`` is in Nm/rad or N/m, d in Nms/rad or Ns/m, L in Nm or N. If k is learned, the motion
+    determines all forces only up to a common factor. A fixed k, known bodies or a feed-forward
+    force determine the factor.
 
     Args:
         scales: scales of the data. With a prior, the value is the typical force, ``(N,)``.
-        stiffness: initial k, one number or n. The default follows from the data, and from
-            the limit if it is a number.
+        stiffness: initial k, one number or n. The default is computed from the data, and from the
+            limit if it is a number.
         spread: prior standard deviation of the logarithm of the constants; 0 fixes k.
         limit: L, one number or n; ``"learned"``; or None for a servo that does not saturate.
         joints: coordinates with a servo, in the order of the targets. The default is all.
@@ -80,7 +81,8 @@ class Servo(Drives):
         spread_of_q = data.q_std[index].double()
         stiffness, limit = listed(stiffness), listed(limit)
         if stiffness is None and limit not in (None, "learned"):
-            stiffness = (torch.as_tensor(limit) / spread_of_q).tolist()  # saturates at that error
+            # The servo saturates at an error of a standard deviation of q.
+            stiffness = (torch.as_tensor(limit) / spread_of_q).tolist()
         if stiffness is None:
             start = _START * force[index] / spread_of_q
         else:
@@ -88,7 +90,7 @@ class Servo(Drives):
             force = force.index_copy(0, torch.tensor(index), start * spread_of_q / _START)
         self._force, force = force, force[index]
         motors = replace(scales, named=tuple(scales.joints[k] for k in index))
-        units = [joint.force + ("/rad" if joint.turns else "/m") for joint in motors.joints]
+        units = [joint.stiffness for joint in motors.joints]
         build = partial(motors.positive, spread=spread or 1.5)
         self.stiffness = build("servo stiffness", 1.0, start, units=units) if spread > 0 else None
         self.damping = self.limit = None
@@ -112,10 +114,9 @@ class Servo(Drives):
         return self.fixed_stiffness if self.stiffness is None else self.stiffness()
 
     def strength(self) -> Tensor:
-        """Return 1 / (1/k + e/L), ``(n,)``, the force by target error, with a typical error e."""
-        return self.spring_constant() / (
-            1 + self.spring_constant() * self.error / self.largest_force()
-        )
+        """Return 1 / (1/k + e/L), ``(n,)``, the force per error of a typical target error e."""
+        stiffness = self.spring_constant()
+        return stiffness / (1 + stiffness * self.error / self.largest_force())
 
     def springs(self) -> Tensor:
         """Return k of all coordinates, ``(N,)``; 0 for a coordinate without a servo."""
@@ -134,7 +135,7 @@ class Servo(Drives):
         return columns.mT.expand(*q.shape[:-1], -1, -1)
 
     def typical_input(self, q: Tensor) -> Tensor:
-        """Return the targets that give no force at rest, ``(*batch, M)``."""
+        """Return the targets without force at rest, ``(*batch, M)``."""
         targets = q @ self.selection.mT
         return nn.functional.pad(targets, (0, self.shape[1] - targets.shape[-1]))
 
@@ -164,7 +165,7 @@ class Servo(Drives):
         return force + (self._limited(linear) - linear) @ self.selection
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """Return a tenth of k times the spread of q, ``(N,)``, the force of a typical lag."""
+        """Return the force of a typical lag, ``(N,)``: k times a tenth of the spread of q."""
         return self._force.to(u_rms)
 
     def _linear_torque(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:

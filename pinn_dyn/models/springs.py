@@ -1,4 +1,4 @@
-"""Springs between joints and their parents, and bodies that are driven through springs."""
+"""Springs between joints and their parents, and elastic joints with motors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pinn_dyn.models.structure import Structure
 
 _START = 0.3  # initial k in units of the typical force over the spread of q
 _SPREAD = 2.0  # prior standard deviation of the logarithms
-_PRELOAD = 3.0  # prior standard deviation of p in typical forces: springs may carry the weight
+_PRELOAD = 3.0  # prior standard deviation of p in typical forces, as springs may carry the weight
 
 
 class JointSprings(nn.Module):
@@ -23,8 +23,8 @@ class JointSprings(nn.Module):
 
         V = sum over j of k_j (q_j - r_j)^2 / 2,    dV/dq_j = k_j q_j - p_j,    p_j = k_j r_j
 
-    k ``(S,)`` in Nm/rad or N/m is positive. The rest angle or position r follows from the force p
-    at q = 0 in Nm or N, in which the equation of motion is linear.
+    k ``(S,)``, Nm/rad or N/m, is positive. The force p at q = 0, Nm or N, is learned instead of the
+    rest angle or position r, because the equation of motion is linear in p.
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
@@ -37,15 +37,13 @@ class JointSprings(nn.Module):
         super().__init__()
         index, force = list(joints), scales.value.double()
         named = [scales.joints[k] for k in index]
-        units = [joint.force + ("/rad" if joint.turns else "/m") for joint in named]
+        units = [joint.stiffness for joint in named]
         start = force / scales.statistics.q_std.double()
         part = Scales(scales.statistics, start, named=tuple(named), prior=True)
         self.stiffness = part.positive("spring stiffness", _START, start[index], _SPREAD, units)
-        self.preload = RealConstants(
-            _PRELOAD * force[index],
-            [f"rest {'angle' if joint.turns else 'position'} of {joint.name}" for joint in named],
-            [joint.force for joint in named],
-        )
+        kinds = {True: "rest angle", False: "rest position"}
+        names = [f"{kinds[joint.turns]} of {joint.name}" for joint in named]
+        self.preload = RealConstants(_PRELOAD * force[index], names, [x.force for x in named])
         self.register_buffer("selection", torch.eye(scales.size)[index], persistent=False)
 
     def springs(self) -> Tensor:
@@ -62,22 +60,23 @@ class JointSprings(nn.Module):
 
     def physical_constants(self) -> list[Named]:
         """Return k and r."""
-        rest = self.preload() / self.stiffness()
+        positions = self.preload() / self.stiffness()
         units = ["rad" if unit == "Nm" else "m" for unit in self.preload.units]
-        return [self.stiffness.named(), self.preload.named()._replace(values=rest, units=units)]
+        rest_positions = self.preload.named()._replace(values=positions, units=units)
+        return [self.stiffness.named(), rest_positions]
 
 
-_RATE = 1e-3  # initial damping over stiffness, s
+_RATE = 1e-3  # ratio of initial damping to stiffness, s
 
 
 class ElasticJoints(nn.Module):
-    """Structure of N link angles q and the S motor angles theta of elastic joints::
+    """Structure with N link angles q and S motor angles theta of elastic joints::
 
         M(q) a + C v + G + F(v) = K (theta - q) + D (theta_dot - v)
         B theta_ddot + F_m(theta_dot) + K (theta - q) + D (theta_dot - v) = tau
 
-    The coordinates are (q, theta), both in the frame of the link, with an encoder each. B is the
-    armature and F_m the friction of a motor. K and D of each elastic joint are learned. Source:
+    The coordinates are (q, theta), both after the gear and measured. B is the armature and F_m the
+    friction of a motor. K and D of each elastic joint are learned. Source:
     Spong (1987), "Modeling and control of elastic joint robots".
 
     Args:
@@ -119,7 +118,10 @@ class ElasticJoints(nn.Module):
         return self.chain.inertia
 
     def motor_forces(self, force: Tensor) -> Tensor:
-        """Return the forces of links at their motors, ``(N + S,)``, from forces on (q, theta)."""
+        """Return the forces of the links at their motors, ``(N + S,)``.
+
+        ``force`` ``(N + S,)`` acts on (q, theta).
+        """
         return self.stretch.clamp(min=0).to(force).mT @ (self.stretch.abs().to(force) @ force)
 
     def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor:
@@ -159,7 +161,7 @@ class ElasticJoints(nn.Module):
 
 
 class Springs(nn.Module):
-    """Learned K and D of elastic joints, ``(S,)``, with the forces K s + D ds/dt of a stretch s."""
+    """Learned K and D of elastic joints, ``(S,)``. A stretch s has the force K s + D ds/dt."""
 
     stretch: Tensor
 

@@ -38,12 +38,12 @@ class Statistics:
 
     @property
     def num_coordinates(self) -> int:
-        """N."""
+        """Number of coordinates N."""
         return self.q_mean.shape[0]
 
     @property
     def num_inputs(self) -> int:
-        """M."""
+        """Number of inputs M."""
         return self.u_mean.shape[0]
 
     @property
@@ -61,20 +61,20 @@ class Statistics:
         return self.qv_increment_std[0, self.num_coordinates :] / self.step
 
     def network_input(self, repeat_input: int) -> tuple[Tensor, Tensor]:
-        """Return the mean and standard deviation of (q, v, u, ... u), for a black box."""
+        """Return the mean and standard deviation of (q, v, u, ... u) for a black box."""
         zero = torch.zeros_like(self.v_std)
         mean = torch.cat([self.q_mean, zero, *[self.u_mean] * repeat_input])
         std = torch.cat([self.q_std, self.v_std, *[self.u_std] * repeat_input])
         return mean, std
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert to lists and floats, as stored in a checkpoint."""
+        """Convert to lists and floats for a checkpoint."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in values.items()}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Statistics:
-        """Build from :meth:`to_dict`, or raise ValueError on a bad number or scale."""
+        """Build from the result of :meth:`to_dict`; raise ValueError on an invalid number."""
         names = [item.name for item in fields(cls)]
         read = {name: torch.tensor(values[name], dtype=torch.float64) for name in names}
         for name, value in read.items():

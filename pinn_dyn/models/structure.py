@@ -11,8 +11,8 @@ from torch import Tensor
 class Structure(Protocol):
     """Rigid bodies with known kinematics. All terms are linear in their pseudo-inertias.
 
-    ``turning`` is true for each revolute joint. ``inertia`` are the pseudo-inertias ``(n, 4, 4)``,
-    ``body_joints`` the numbers of the joints that move the bodies.
+    ``turning`` is true for each revolute joint. ``inertia`` holds the pseudo-inertias
+    ``(n, 4, 4)``, and ``body_joints`` the indices of the joints that move the bodies.
     """
 
     num_coordinates: int

@@ -1,4 +1,4 @@
-"""Base class of the Lagrangian and the Hamiltonian network, with heads for V, D, F and A."""
+"""Base class of Lagrangian and Hamiltonian networks, with heads for V, D, F and A."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ INPUT = partial(NetworkInput, hidden=(16, 16))
 class StructuredNetwork(MechanicalSystem):
     """Mechanical system with learned V, D, F, A and residual force. Subclasses add the mass.
 
-    The scales of the heads come from the data: with the root mean square f of the input, A ~ f/u;
-    with the resulting typical force f_i of coordinate i, D ~ f_i/v_i, F ~ f_i, r ~ f_i and V ~ f q.
-    Without an input f is 1: the motion determines M, V, D and F up to a common factor.
+    The scales of the heads come from the data: A ~ f/u with the root mean square f of the input,
+    and D ~ f_i/v_i, F ~ f_i, r ~ f_i and V ~ f q with the typical force f_i of coordinate i.
+    Without inputs, f is 1: the motion determines M, V, D and F only up to a common factor.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class StructuredNetwork(MechanicalSystem):
         self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
         self.friction = friction(self._scales(statistics, force))
         if self.friction.by_load:
-            raise ValueError("a loss by load needs known drives: use model=known")
+            raise ValueError("friction with a loss by load needs known drives: use model=known")
         self.sticking = self.friction.sticking
         if self.sticking and state == "qp":
             raise ValueError(

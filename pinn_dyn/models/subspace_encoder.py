@@ -1,4 +1,4 @@
-"""Models with a latent state that an encoder computes from the measured state and its past."""
+"""Models with a latent state that an encoder computes from the measured state history."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from pinn_dyn.models.mlp import Activation
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
-_TIMES = 4  # time constants of an offset of the start
-_SHARE_RATE = 10.0  # rate at which their shares are learned, times that of the weights
+_TIMES = 4  # number of time constants of the initial offset
+_SHARE_RATE = 10.0  # learning rate of their shares, relative to that of the weights
 
 
 class LinearAndMLP(nn.Module):
-    """y = W x + b + MLP(x). W and the first layer of the MLP are one matrix.
+    """y = W x + b + MLP(x). W and the first layer of the MLP share a matrix product.
 
     Args:
         inputs, outputs: sizes of x and y.
@@ -47,7 +47,7 @@ class LinearAndMLP(nn.Module):
         return self.after_first(self.first(x))
 
     def after_first(self, first: Tensor) -> Tensor:
-        """Return y from the products of the first matrix."""
+        """Return y from the output of the first layer."""
         y, h = first.split(self._sizes, dim=-1)
         for layer in self.layers:
             h = layer(self._activation(h))
@@ -55,7 +55,7 @@ class LinearAndMLP(nn.Module):
 
 
 def _add_shares(model: nn.Module, state: dict[str, Tensor], *_: Any) -> None:
-    """Complete the weights of a model whose offset has one time constant."""
+    """Complete the weights of an earlier version with a single time constant of the offset."""
     if "share" not in state and "fade" in state:
         state["fade"] = state["fade"].unsqueeze(-1).repeat(1, _TIMES)
         state["share"] = torch.zeros_like(state["fade"])
@@ -70,25 +70,25 @@ class EncodedPredictor(Predictor):
 
     Symbols: latent state z ``(*batch, latent)``, state y of the robot ``(*batch, 2N)``, step h.
     y, q and u are normalized by their means and standard deviations. The encoder and the output are
-    sums of a linear map and an MLP. The last term starts the prediction at the measured y_0. Each
-    component of y has four time constants tau_j, initially from a step to the length of the
-    training windows, and their shares, whose sum is 1. Both are learned: a slow robot keeps what
-    the model does not explain, a fast one drops it. A learned v_0 replaces the measured one.
-    Subclasses define how z moves (:meth:`latent_path`).
+    sums of a linear map and an MLP. The last term makes the prediction start at the measured y_0.
+    Each component of y has four time constants tau_j, initially from a step to the length of the
+    training windows, with shares whose sum is 1. Both are learned. The offset that the model does
+    not explain then fades slowly for slow robots, and fast for fast robots. A learned v_0 replaces
+    the measured v_0. Subclasses define the motion of z (:meth:`latent_path`).
 
-    Unknown q and u before the start repeat the first sample: the robot was at rest. The memory of a
-    rollout is z and the fading terms, see :meth:`start` and :meth:`next_state`.
+    Unknown q and u before the start repeat the first sample, as for a robot at rest. The memory of
+    a rollout is z and the fading terms, see :meth:`start` and :meth:`next_state`.
 
     Source: Beintema, Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system
     identification". The fading term is not part of it.
 
     Args:
         statistics: scales of the data.
-        history: time before the start that the encoder sees, s; n steps of the training windows.
-            Pieces of a log keep 2 s.
+        history: length of the past that the encoder uses, s; n steps of the training windows.
+            Pieces of a log keep 2 s of their past.
         latent: size of z.
         hidden, activation: widths and activation of the hidden layers of all networks.
-        fade: initial exp(-h / tau_j) of all j; None takes tau_j from a step to the windows.
+        fade: initial exp(-h / tau_j) of all j; None spreads tau_j as above.
         initial_velocity: builder of the head for v_0.
     """
 
@@ -152,8 +152,8 @@ class EncodedPredictor(Predictor):
         """Return the memory of a rollout, ``(*batch, latent + 8N)``: z and parts of y - output(z).
 
         Args:
-            q, v, u: present state and input, ``(*batch, N or M)``.
-            q_past, u_past: q and u of the n steps before, the latest first, ``(*batch, n N)`` and
+            q, v, u: current state and input, ``(*batch, N or M)``.
+            q_past, u_past: q and u of the previous n steps, the latest first, ``(*batch, n N)`` and
                 ``(*batch, n M)``.
         """
         start = start_of(self.initial_velocity, torch.cat([q, v], dim=-1), u)
@@ -166,7 +166,7 @@ class EncodedPredictor(Predictor):
     def next_state(
         self, memory: Tensor, u: Tensor, u_next: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the memory, q and v a step later, from u at the start and the end of the step."""
+        """Return memory, q and v after a step with u at its start and u_next at its end."""
         size = 2 * self.num_coordinates
         z, parts = memory.tensor_split([memory.shape[-1] - self.fade.numel()], dim=-1)
         ends = (torch.cat([u, u_next], dim=-1) - self._input_mean) / self._input_std
@@ -197,7 +197,7 @@ class EncodedPredictor(Predictor):
         self._require_step(t)
         size, n = self.num_coordinates, self.past_steps
         before = t[0] - self.step.to(t) * torch.arange(n + 1, device=t.device)
-        at_rest = [x0[..., :size]] * n  # cut off if the past is known
+        at_rest = [x0[..., :size]] * n  # replaces a missing past, and is cut off otherwise
         u_past = input.at(before).to(x0)
         measured, q_past = torch.cat([x0, *at_rest], dim=-1).tensor_split([2 * size], dim=-1)
         start = start_of(self.initial_velocity, measured, u_past[0])
@@ -219,9 +219,9 @@ class SubspaceEncoder(EncodedPredictor):
 
         z_{k+1} = z_k + transition(z_k, u_k, u_{k+1})
 
-    The transition is the sum of a linear map and an MLP. z may hold states that are not measured,
-    such as those of actuators. Training on windows of many steps is the truncated simulation loss.
-    The encoder and the output are those of :class:`EncodedPredictor`, as are the arguments.
+    The transition is the sum of a linear map and an MLP. z may represent states that are not
+    measured, such as those of actuators. Training on windows of many steps minimizes the truncated
+    simulation loss. Encoder, output and arguments: :class:`EncodedPredictor`.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class SubspaceEncoder(EncodedPredictor):
         self, inputs: int, latent: int, hidden: Sequence[int], activation: Activation
     ) -> None:
         self.transition = LinearAndMLP(latent + 2 * inputs, latent, hidden, activation)
-        with torch.no_grad():  # decay, so that the first rollouts over many steps do not diverge
+        with torch.no_grad():  # z decays, which keeps the first long rollouts from diverging
             self.transition.first.weight[:latent, :latent] -= 0.5 * torch.eye(latent)
 
     def latent_path(self, z: Tensor, ends: Tensor) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""Analytic and simulated robots, the truth that models are compared with."""
+"""Analytic and simulated robots, the ground truth of learned models."""
 
 from pinn_dyn.systems.bullet_arm import BulletArm
 from pinn_dyn.systems.mujoco_arm import MujocoArm

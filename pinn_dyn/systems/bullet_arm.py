@@ -12,13 +12,13 @@ from pinn_dyn.systems.simulated_arm import SimulatedArm
 
 
 class _World:
-    """A PyBullet client that holds one arm, where only gravity and the applied torques act."""
+    """A PyBullet client with one arm, on which only gravity and the applied torques act."""
 
     def __init__(self, text: str, gravity: tuple[float, ...]):
         import pybullet as bullet
 
         self._bullet = bullet
-        # Not the wheel's own BulletClient: it closes closed clients when Python ends, and prints.
+        # Avoid BulletClient of the wheel, which closes closed clients at exit and prints a message.
         client = self._client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "arm.urdf"
@@ -33,10 +33,10 @@ class _World:
         undamped = {"linearDamping": 0, "angularDamping": 0, "jointDamping": 0}
         inertias = ET.fromstring(text).findall("link[@name!='base']//inertia")
         for joint, inertia in zip(self._joints, inertias, strict=True):
-            # The reader of PyBullet drops unphysical moments.
+            # Set the moments explicitly, since the URDF reader of PyBullet drops unphysical ones.
             moments = [float(inertia.get(key, 0.0)) for key in ("ixx", "iyy", "izz")]
             bullet.changeDynamics(body, joint, localInertiaDiagonal=moments, **undamped, **client)
-        # PyBullet holds every joint by a velocity motor unless the motor has no force.
+        # Switch off the velocity motors by which PyBullet holds all joints.
         bullet.setJointMotorControlArray(
             body, self._joints, bullet.VELOCITY_CONTROL, forces=[0.0] * len(names), **client
         )

@@ -12,8 +12,9 @@ def pseudo_inertia_basis() -> Tensor:
     """Return E ``(10, 4, 4)``, float64, with J = sum over a of pi_a E_a.
 
     J = [[S, h], [h^T, m]] with h = m c and S the second moments of the mass about the origin,
-    S = tr(I) / 2 - I. J is positive definite for bodies of positive density alone (Wensing, Kim and
-    Slotine 2018, "Linear matrix inequalities for ... inertial parameter identification").
+    S = tr(I) / 2 - I. J is positive definite if and only if the body can have a positive density
+    (Wensing, Kim and Slotine 2018, "Linear matrix inequalities for ... inertial parameter
+    identification").
     """
     basis = torch.zeros(10, 4, 4, dtype=torch.float64)
     basis[0, 3, 3] = 1

@@ -18,10 +18,11 @@ _UNUSED = (*_LOOKS, "keys", "sensors", "actuators", "tendons", "pairs")
 def mjcf_to_urdf(source: Path | str) -> str:
     """Return a URDF of the robot in an MJCF file or text.
 
-    All frames are parallel to the world's at qpos = 0. A body with several joints gets massless
-    links between them. Bodies without ``<inertial>`` have the inertia of their geoms, and none if
-    meshes are missing on this machine. A site is a link without mass. An equality between two
-    joints, if it is linear, is a ``<mimic>``. A ``<note>`` lists what a URDF cannot express.
+    All frames are parallel to the world frame at qpos = 0. A body with several joints gets
+    massless links between them. Bodies without ``<inertial>`` have the inertia of their geoms, or
+    an unknown inertia if their meshes are missing. A site becomes a massless link. A linear
+    equality of two joints becomes a ``<mimic>``. A ``<note>`` names each effect that a URDF cannot
+    express.
 
     Raises:
         ImportError: without MuJoCo.
@@ -40,7 +41,8 @@ def mjcf_to_urdf(source: Path | str) -> str:
     data = mujoco.MjData(model)
     kinds = [_KINDS[k] for k in model.jnt_type]
     notes = _unread(mujoco, model)
-    data.qpos[[model.jnt_qposadr[j] for j, x in enumerate(kinds) if x not in _KINDS[:2]]] = 0
+    scalar = [j for j, kind in enumerate(kinds) if kind not in _KINDS[:2]]
+    data.qpos[model.jnt_qposadr[scalar]] = 0
     mujoco.mj_kinematics(model, data)
     links = [model.body(k).name for k in range(model.nbody)]
     joints = [model.joint(j).name or f"joint{j}" for j in range(model.njnt)]
@@ -82,16 +84,16 @@ def mjcf_to_urdf(source: Path | str) -> str:
 
 
 def _compiled(mujoco: Any, source: Path | str) -> tuple[Any, set[str]]:
-    """Return the compiled robot, and the names of bodies whose inertia is not known.
+    """Return the compiled robot, and the names of bodies with unknown inertia.
 
-    Looks and geoms that do not matter for the inertia are left out.
+    Materials, and geoms without influence on the inertia, are left out.
     """
     is_file = isinstance(source, Path)
     spec = mujoco.MjSpec.from_file(str(source)) if is_file else mujoco.MjSpec.from_string(source)
     for kind in _UNUSED:
         for element in list(getattr(spec, kind)):
             spec.delete(element)
-    forced = int(spec.compiler.inertiafromgeom) == 1  # always
+    forced = int(spec.compiler.inertiafromgeom) == 1  # geoms replace every <inertial>
     for element in [*spec.geoms, *spec.sites]:
         element.material = ""
     for geom in list(spec.geoms):
@@ -113,7 +115,7 @@ def _compiled(mujoco: Any, source: Path | str) -> tuple[Any, set[str]]:
 
 
 def _without_meshes(spec: Any) -> tuple[Any, set[str]]:
-    """Return the compiled robot with a mass of 1 kg for bodies whose inertia is not known."""
+    """Return the robot compiled with 1 kg for bodies of unknown inertia, and their names."""
     unknown = {geom.parent.name for geom in spec.geoms if geom.meshname}
     for element in [*(geom for geom in spec.geoms if geom.meshname), *spec.meshes]:
         spec.delete(element)
@@ -126,7 +128,7 @@ def _without_meshes(spec: Any) -> tuple[Any, set[str]]:
 
 
 def _unread(mujoco: Any, model: Any) -> list[str]:
-    """Return what acts on the robot in MuJoCo but is not part of a URDF."""
+    """Return the names of effects in the MJCF that a URDF cannot express."""
     is_joint = model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
     closed = model.eq_active0.astype(bool) & ~(is_joint & ~model.eq_data[:, 2:5].any(1))
     effects = {
@@ -142,10 +144,11 @@ def _unread(mujoco: Any, model: Any) -> list[str]:
 
 
 def _mimics(mujoco: Any, model: Any, joints: list[str]) -> dict[int, str]:
-    """Return ``<mimic>`` of each joint j with q_j - q_j0 = a0 + a1 (q_i - q_i0)."""
+    """Return the ``<mimic>`` of each joint j with q_j - q_j0 = a0 + a1 (q_i - q_i0)."""
     mimics = {}
     for k in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
-        follower, master, factors = model.eq_obj1id[k], model.eq_obj2id[k], model.eq_data[k, :5]
+        follower, master = model.eq_obj1id[k], model.eq_obj2id[k]
+        factors = model.eq_data[k, :5]
         if model.eq_active0[k] and master >= 0 and not factors[2:].any():
             start, driver = model.qpos0[model.jnt_qposadr[[follower, master]]]
             offset = start + factors[0] - factors[1] * driver
@@ -168,8 +171,9 @@ def _joint(
 def _inertial(model: Any, data: Any, body: int, origin: np.ndarray) -> str:
     axes = data.ximat[body].reshape(3, 3)
     moments = axes * model.body_inertia[body] @ axes.T
-    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
-    text = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{moments[i, j]}"' for i, j in pairs)
+    upper = moments[np.triu_indices(3)]
+    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    text = " ".join(f'{key}="{moment}"' for key, moment in zip(keys, upper, strict=True))
     return (
         f'<inertial><mass value="{model.body_mass[body]}"/><inertia {text}/>'
         f'<origin xyz="{exact_text(data.xipos[body] - origin)}"/></inertial>'
@@ -177,5 +181,5 @@ def _inertial(model: Any, data: Any, body: int, origin: np.ndarray) -> str:
 
 
 def exact_text(values: Iterable[float] | Tensor) -> str:
-    """Return numbers for an attribute in XML, without rounding."""
+    """Return numbers as the text of an XML attribute, without rounding."""
     return " ".join(repr(float(value)) for value in values)

@@ -10,7 +10,7 @@ from pinn_dyn.systems.simulated_arm import SimulatedArm
 
 
 class _World:
-    """A MuJoCo model of one arm, where only gravity and the applied torques act."""
+    """A MuJoCo model of one arm, on which only gravity and the applied torques act."""
 
     def __init__(self, text: str, gravity: tuple[float, ...]):
         import mujoco

@@ -1,4 +1,4 @@
-"""Protocols of what a robot may offer beyond its equation of motion."""
+"""Protocols of optional features of a robot: tip, limits, domain, simulation, drawing."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torch import Tensor
 
 @runtime_checkable
 class HasTip(Protocol):
-    """A robot with an end effector, which can follow a path."""
+    """A robot with an end effector that can follow a path."""
 
     num_coordinates: int
 
     def tip_position(self, q: Tensor) -> Tensor:
-        """Return the tip in the frame of the base, ``(*batch, 3)``, m; differentiable."""
+        """Return the position of the tip in the base frame, ``(*batch, 3)``, m; differentiable."""
 
 
 @runtime_checkable
 class HasLimits(Protocol):
-    """A robot with limits of the configuration, of the speeds ``(N,)`` and inputs ``(M,)``."""
+    """A robot with limits of configurations and speeds, ``(N,)``, and of inputs, ``(M,)``."""
 
     joint_names: list[str]
     q_low: np.ndarray
@@ -31,10 +31,10 @@ class HasLimits(Protocol):
 
 @runtime_checkable
 class HasDomain(Protocol):
-    """A system that knows where its equation of motion holds."""
+    """A system that knows the configurations at which its equation of motion holds."""
 
     def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
-        """Raise a ValueError unless it holds for all q from ``q_low`` to ``q_high``, ``(N,)``."""
+        """Raise a ValueError if it fails for a q from ``q_low`` to ``q_high``, ``(N,)`` each."""
 
 
 @runtime_checkable
@@ -45,7 +45,7 @@ class Stepped(Protocol):
     num_inputs: int
 
     def set_state(self, q: np.ndarray, v: np.ndarray) -> None:
-        """Put the robot into a state, ``(N,)`` each, from which :meth:`step` moves it."""
+        """Set the state q, v, ``(N,)`` each, at which the next :meth:`step` starts."""
 
     def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
         """Return q and v, ``(N,)`` each, after ``step`` s under an input ``(M,)``."""
@@ -53,7 +53,7 @@ class Stepped(Protocol):
 
 @runtime_checkable
 class Drawable(Protocol):
-    """A robot that is drawn as lines, from its base to its tip."""
+    """A robot that can be drawn as lines from its base to its tip."""
 
     z_is_down: bool
 

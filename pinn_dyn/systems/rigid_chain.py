@@ -17,14 +17,14 @@ from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia_basis, 
 from pinn_dyn.systems.segment_frames import cross_matrix
 from pinn_dyn.systems.urdf import read_urdf
 
-_ROUNDED = 0.1  # smallest over largest variance of a mass, below zero by rounded moments
-_LARGEST = 10.0  # radius of gyration of a body, m
+_ROUNDED = 0.1  # largest negative variance of a mass that counts as rounding, per largest variance
+_LARGEST = 10.0  # largest plausible radius of gyration of a body, m
 
 
 class Kinematics(NamedTuple):
     """Poses T of the B bodies in the world, and twists xi of the B joints, ``(*batch, B, 4, 4)``.
 
-    A point x = (x, y, z, 1) that a joint moves at unit speed has the velocity xi x.
+    A joint that moves at unit speed gives the point x = (x, y, z, 1) the velocity xi x.
     """
 
     poses: Tensor
@@ -37,21 +37,22 @@ class RigidChain(MechanicalSystem):
         M(q) a + C(q, v) v + G(q) + D v = u
 
     Let T_k be the pose of body k, J_k its pseudo-inertia (:mod:`pinn_dyn.systems.inertia`) in the
-    world's frame, xi_j the twist of joint j as a 4 x 4 matrix, <A, B> = sum_il A_il B_il, and
-    j <= k say that joint j moves body k. With composite bodies Jc_j = sum over k >= j of J_k
-    (composite-rigid-body algorithm)::
+    world frame, xi_j the twist of joint j as a 4 x 4 matrix, and <A, B> = sum_il A_il B_il. The
+    relation j <= k means that joint j moves body k. With composite bodies Jc_j = sum over k >= j
+    of J_k (composite-rigid-body algorithm)::
 
         M_jk  = <xi_j, xi_k Jc_k>                           for j <= k, symmetric
         Xi_k  = sum over j <= k of xi_j v_j                 velocity of body k
         Xi'_k = sum over j <= k of xi_j a_j + (Xi_j xi_j - xi_j Xi_j) v_j
         tau_j = <xi_j, sum over k >= j of (Xi'_k + Xi_k^2 - Gamma) J_k>
 
-    where Gamma holds gravity in its last column: the recursive Newton-Euler algorithm. J enters
-    linearly, and so do the ten inertial parameters of each body (:meth:`regressor`). Functions take
-    another ``inertia`` than the URDF's, which a model learns.
+    where Gamma holds gravity in its last column: the recursive Newton-Euler algorithm. The forces
+    are linear in J and in the ten inertial parameters of each body (:meth:`regressor`). A model
+    that learns the bodies passes its own ``inertia`` to the methods.
 
-    The N coordinates move the joints by S q, with S ``(B, N)``: the identity, unless ``joints`` has
-    another order or joints mimic others. Then M is S^T M S with the M above, and tau is S^T tau.
+    The N coordinates q move the joints by S q, with S ``(B, N)``. S is the identity, unless
+    ``joints`` changes the order or joints mimic others. Then M is S^T M S with the M above, and tau
+    is S^T tau.
 
     Sources: Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 5 and 6; Legnani et al. 1996, "A
     homogeneous matrix approach to 3D kinematics and dynamics".
@@ -59,21 +60,21 @@ class RigidChain(MechanicalSystem):
     Args:
         urdf: path of a URDF or MJCF, one that ships with pinn_dyn (``franka_panda/panda.urdf``) or
             PyBullet, or the text of the file.
-        joints: names of the joints that move, in the order of the coordinates, the others are held
-            at zero; None for all that mimic no other joint, in the order of the file.
+        joints: names of the joints that move, in the order of the coordinates; all other joints are
+            held at zero. None for all joints that mimic no joint, in the order of the file.
         locked_joints: names of joints that are held at zero, or positions by name, rad or m.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
         gravity: gravitational acceleration in the frame of the base, m/s^2, 3 numbers.
-        tip: link that carries the payload; None for the last of the file without a joint behind it.
+        tip: link that carries the payload; None for the last link of the file without child joints.
         mass_scale: factor of all masses and inertias.
-        payload: point mass at the origin of the tip's frame, kg, which is not scaled.
+        payload: point mass at the origin of the tip frame, kg, not scaled by ``mass_scale``.
 
     Attributes:
         joint_names: N names of the coordinates.
-        body_names: B names; a body is a link with everything fixed to it.
+        body_names: B names; a body is a link with all links fixed to it.
         body_joints: index of the coordinate that moves the joint of each body, B.
         turning: true for a coordinate that turns, false for one that slides, N.
-        tree: everything read from the file, see :class:`~pinn_dyn.systems.urdf.Tree`.
+        tree: contents of the file, see :class:`~pinn_dyn.systems.urdf.Tree`.
         limits: position, speed and effort of the coordinates, ``(N, 4)``.
         inertia: pseudo-inertias of the file, ``(B, 4, 4)``, in the frames of the joints.
 
@@ -116,7 +117,7 @@ class RigidChain(MechanicalSystem):
         )
         bodies, size = tree.coupling.shape
         super().__init__(num_coordinates=size, num_inputs=size)
-        # The description of a run in Python reads the arguments.
+        # Keep the arguments, which a run stores as the description of the robot.
         self.urdf, self.joints, self.locked_joints = urdf, joints, locked_joints
         self.damping, self.gravity = damping, gravity
         self.tip, self.mass_scale, self.payload = tip, mass_scale, payload
@@ -127,8 +128,9 @@ class RigidChain(MechanicalSystem):
         self.turning = tree.turning
         self.parents = tuple(tree.parents)
         self.limits = tree.limits
-        # The pose of a joint is F0 + s F1 + c F2, with s = sin q and c = 1 - cos q (Rodrigues'
-        # formula), or s = q and c = 0 where it slides.
+        # Joint models (Featherstone 2008, sec. 4.4): the pose of a joint is F0 + s F1 + c F2, with
+        # s = sin q and c = 1 - cos q for a turning joint (Rodrigues' formula), and s = q and c = 0
+        # for a sliding joint.
         turning = tree.revolute
         axes = torch.where(turning[:, None], tree.axes, 0)
         cross = torch.zeros(bodies, 4, 4, dtype=double)
@@ -137,7 +139,8 @@ class RigidChain(MechanicalSystem):
         slide[:, :3, 3] = tree.axes - axes
         start = torch.eye(4, dtype=double).expand(bodies, 4, 4)
         placements = tree.placements @ torch.stack([start, cross + slide, cross @ cross])
-        moved = torch.eye(bodies, dtype=double)  # row j: the bodies that joint j moves
+        # Connectivity: moved[j, k] = 1 if joint j moves body k (Featherstone 2008, sec. 4.1).
+        moved = torch.eye(bodies, dtype=double)
         for k, parent in enumerate(tree.parents):
             if parent >= 0:
                 moved[:, k] += moved[:, parent]
@@ -170,10 +173,11 @@ class RigidChain(MechanicalSystem):
 
     def _with(self, name: str, value: Any) -> RigidChain:
         names = inspect.signature(type(self)).parameters
-        return type(self)(**{**{x: getattr(self, x) for x in names}, name: value})
+        arguments = {key: getattr(self, key) for key in names}
+        return type(self)(**arguments | {name: value})
 
     def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
-        """Check that the bodies of the file have a positive mass matrix at q = 0.
+        """Check that the mass matrix of the file's bodies is positive definite at q = 0.
 
         Raises:
             ValueError: if M is singular or indefinite.
@@ -188,7 +192,7 @@ class RigidChain(MechanicalSystem):
             )
 
     def _apply(self, fn: Callable[..., Tensor], recurse: bool = True) -> RigidChain:
-        """Convert the buffers. Back in double precision, rotations are exact again."""
+        """Convert the buffers. Conversion back to double precision restores exact values."""
         super()._apply(fn, recurse)
         for name, value in self._exact.items():
             buffer = getattr(self, name)
@@ -198,16 +202,19 @@ class RigidChain(MechanicalSystem):
 
     def kinematics(self, q: Tensor) -> Kinematics:
         """Return poses and twists at q ``(*batch, N)``."""
+        # Joint models (Featherstone 2008, sec. 4.4).
         q = self._of_joints(q)
         turning = self._turning.squeeze(-1)
         first = turning * torch.sin(q) + (1 - turning) * q
         second = turning * (1 - torch.cos(q))
         start, along, across = self._placements
         local = start + first[..., None, None] * along + second[..., None, None] * across
+        # Forward pass: poses of the bodies, from the base to the tips.
         poses: list[Tensor] = []
         for parent, step in zip(self.parents, local.unbind(-3), strict=True):
             poses.append(step if parent < 0 else poses[parent] @ step)
         stacked = torch.stack(poses, dim=-3)
+        # Twists of the joints at unit speed, in the world frame.
         axis = matvec(stacked[..., :3, :3], self._axes)
         moment = torch.linalg.cross(stacked[..., :3, 3], axis)
         turn = self._turning
@@ -217,7 +224,7 @@ class RigidChain(MechanicalSystem):
     def mass_and_bias(
         self, q: Tensor, v: Tensor, inertia: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return M and C v + G with the bodies ``inertia`` ``(N, 4, 4)``, the URDF's if None."""
+        """Return M and C v + G. ``inertia`` ``(B, 4, 4)`` defaults to the bodies of the file."""
         at = self.kinematics(q)
         bodies = self._in_world(at, inertia)
         bias = self._force(at, self._accelerations(at, v, None, self._gravity), bodies)
@@ -234,13 +241,19 @@ class RigidChain(MechanicalSystem):
     def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """Return Y ``(*batch, N, 10 B)`` with M a + C v + G = Y pi.
 
-        pi ``(10 B,)`` are ten parameters of each body, body after body, in the order of Pinocchio:
+        pi ``(10 B,)`` holds ten parameters of each body, body by body, in the order of Pinocchio:
         m in kg, m c in kg m, and Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the frame's origin in kg m^2.
+
+        Source: Atkeson, An and Hollerbach 1986, "Estimation of inertial parameters of manipulator
+        loads and links".
         """
+        # Accelerations of the bodies, in the frames of their joints.
         at = self.kinematics(q)
         moving = self._accelerations(at, v, a, self._gravity) @ at.poses
+        # Torque at joint j per entry of the pseudo-inertia of body k, zero unless j moves k.
         per_joint = at.twists.unsqueeze(-3) @ at.poses.unsqueeze(-4)  # (*batch, j, k, 4, 4)
         per_body = moving.unsqueeze(-4).mT @ per_joint * self._moved[..., None, None]
+        # Torque per inertial parameter.
         rows = (per_body.flatten(-2) @ self._basis.flatten(1).T).flatten(-2)
         return self._coupling.mT @ rows if self._coupled else rows
 
@@ -249,20 +262,22 @@ class RigidChain(MechanicalSystem):
     ) -> tuple[Tensor, Tensor]:
         """Return dtau/dq and dtau/dv of tau = M a + C v + G at fixed a, ``(*batch, N, N)`` each.
 
-        Seen from the bodies behind joint i, a change of q_i turns what lies before it, gravity
-        included, and nothing else. With p the body before joint i, m the later of the joints i and
-        j on one branch (0 for joints on different ones), H_m = sum over k >= m of Xi_k J_k, F_m the
-        force on the bodies from m on, and [A, B] = A B - B A::
+        In the frame of the bodies that joint i moves, a change of q_i only turns the parent bodies
+        and gravity. Let p be the parent body of joint i, m the joint of i and j that is farther
+        from the base (the derivatives are zero if i and j lie on different branches), H_m = sum
+        over k >= m of Xi_k J_k, F_m the force on the bodies k >= m, and [A, B] = A B - B A. Then::
 
             d_i = [Xi_p, xi_i],    E_i = [Xi'_p, xi_i] - [d_i, Xi_p] + xi_i Gamma
             dtau_j/dq_i = <xi_j, 2 d_i H_m + E_i Jc_m>  (+ <xi_j, xi_i F_i + F_i xi_i^T> if i > j)
             dtau_j/dv_i = 2 <xi_j, xi_i H_m + d_i Jc_m>
 
-        The same derivatives by spatial vectors: Carpentier and Mansard 2018.
+        Carpentier and Mansard 2018, "Analytical derivatives of rigid body dynamics algorithms",
+        give the same derivatives by spatial vectors.
         """
         at = self.kinematics(q)
         twists, bodies = at.twists, self._in_world(at, inertia)
         v, a = self._of_joints(v), self._of_joints(a)
+        # Velocities and accelerations of the bodies, and their changes with q_i.
         joint_velocity = twists * v[..., None, None]
         velocity = self._tree_sum(self._moved.mT, joint_velocity)
         before = velocity - joint_velocity
@@ -273,13 +288,13 @@ class RigidChain(MechanicalSystem):
         shifted = _bracket(change - joint_change, twists) - _bracket(turned, before)
         shifted = shifted + twists @ gravity
         accelerations = change + velocity @ velocity - gravity
-        momentum, force, composite = (
-            self._tree_sum(self._moved, x)
-            for x in (velocity @ bodies, accelerations @ bodies, bodies)
-        )
+        # Sums over the bodies that each joint moves.
+        momentum = self._tree_sum(self._moved, velocity @ bodies)
+        force = self._tree_sum(self._moved, accelerations @ bodies)
+        composite = self._tree_sum(self._moved, bodies)
         by_momentum, by_composite = twists @ momentum.mT, twists @ composite
         turning = 2 * turned @ momentum + shifted @ composite
-        # Row j, column i: of joints i behind j, and of those before it or j itself.
+        # Derivative of tau_j (row j) by joint i (column i): i > j (later), i <= j (former).
         to_later = _pairs(twists, turning + twists @ force + force @ twists.mT)
         to_former = 2 * _pairs(by_momentum, turned) + _pairs(by_composite, shifted)
         slowing = _pairs(twists, twists @ momentum + turned @ composite)
@@ -294,27 +309,28 @@ class RigidChain(MechanicalSystem):
         return inertial_parameters(self.inertia if inertia is None else inertia)
 
     def _ends(self) -> list[Tensor | None]:
-        """Return the farthest next joint of each body in the frame of its joint, m."""
+        """Return the position of the farthest child joint of each body, in its joint frame, m."""
         starts = self._placements[0, :, :3, 3].double()
-        behind: list[list[Tensor]] = [[] for _ in self.parents]
+        children: list[list[Tensor]] = [[] for _ in self.parents]
         for start, parent in zip(starts, self.parents, strict=True):
             if parent >= 0:
-                behind[parent].append(start)
-        return [max(points, key=torch.linalg.norm, default=None) for points in behind]
+                children[parent].append(start)
+        return [max(points, key=torch.linalg.norm, default=None) for points in children]
 
     def _usual_length(self) -> float:
-        """Return the mean distance of joints, m; 0.1 m if there is one joint."""
+        """Return the mean distance between joints, m; 0.1 m for a single joint."""
         norms = [float(end.norm()) for end in self._ends() if end is not None]
         lengths = [length for length in norms if length > 0.02]
         return sum(lengths) / len(lengths) if lengths else 0.1
 
     def generic_inertia(self, density: float = 1000.0) -> Tensor:
-        """Return pseudo-inertias ``(B, 4, 4)`` from the kinematics alone: a rod for each body.
+        """Return pseudo-inertias ``(B, 4, 4)`` of rods, one per body, from the kinematics alone.
 
-        A rod leads to the farthest next joint, or, where that is nearer than half the mean
-        distance, along the joint's axis by the mean distance. Its radius is a sixth of that mean.
-        The last rod behind a turning joint has 45 degrees to the axis, and hangs down at q = 0: on
-        the axis, gravity and inertia would have no torque.
+        A rod ends at the farthest child joint. If this joint is nearer than half the mean distance
+        between joints, the rod has the mean distance as its length and lies along the joint axis.
+        Its radius is a sixth of the mean distance. The last rod after a turning joint is inclined
+        by 45 degrees to the axis and hangs down at q = 0. A rod on the axis would have no torque
+        by gravity and inertia.
         """
         usual = self._usual_length()
         origin = torch.zeros(self.num_coordinates).to(self._axes)
@@ -327,23 +343,26 @@ class RigidChain(MechanicalSystem):
                 across = directions - (directions @ axis)[:, None] * axis
                 side = next(x for x in across if x.norm() > 0.1)
                 end = usual * (axis + side / side.norm()) / 2**0.5
-            end = usual * axis if end is None or end.norm() < usual / 2 else end
+            if end is None or end.norm() < usual / 2:
+                end = usual * axis
             bodies.append(rod(torch.zeros_like(end), end, radius=usual / 6, density=density))
         return torch.stack(bodies)
 
     def prior_inertia(self) -> Tensor:
         """Return pseudo-inertias ``(B, 4, 4)`` of positive density, close to those of the file.
 
-        A point mass, rod or plate has a standard deviation of its mass of at least l / 300 along
-        each axis, with the mean distance l of the joints: 1 mm for links of 0.3 m. A body that
-        cannot exist is the generic one: without a positive mass, with moments that violate the
-        triangle inequality by more than rounding, or with a radius of gyration of 10 m or more.
+        The radius of gyration along each axis is at least l / 300, with the mean distance l between
+        joints: 1 mm for links of 0.3 m. This replaces point masses, thin rods and plates by bodies
+        with a volume. :meth:`generic_inertia` replaces bodies that cannot exist: without a positive
+        mass, with moments that violate the triangle inequality by more than rounding, or with a
+        radius of gyration of 10 m or more.
         """
         masses = self.inertia[:, 3, 3]
         mass = torch.where(masses > 0, masses, 1.0)[:, None, None]
         centre = self.inertia[:, :3, 3:] / mass
         sizes, axes = torch.linalg.eigh(self.inertia[:, :3, :3] / mass - centre @ centre.mT)
-        smallest, largest, floor = sizes[:, 0], sizes[:, -1], (self._usual_length() / 300) ** 2
+        smallest, largest = sizes[:, 0], sizes[:, -1]
+        floor = (self._usual_length() / 300) ** 2
         rounding = floor + _ROUNDED * largest
         possible = (masses > 0) & (smallest > -rounding) & (largest < _LARGEST**2)
         sizes = sizes.clamp_min(floor)
@@ -353,7 +372,7 @@ class RigidChain(MechanicalSystem):
         return torch.where(possible[:, None, None], mass * inertia, self.generic_inertia())
 
     def tip_position(self, q: Tensor) -> Tensor:
-        """Return the origin of the tip's frame in the frame of the base, ``(*batch, 3)``, m."""
+        """Return the origin of the tip frame in the base frame, ``(*batch, 3)``, m."""
         self._check(q=q)
         origin = self._tip_pose[:, 3]
         if self._tip_body < 0:
@@ -361,9 +380,9 @@ class RigidChain(MechanicalSystem):
         return self.kinematics(q).poses[..., self._tip_body, :3, :] @ origin
 
     def tip_jacobian(self, q: Tensor) -> Tensor:
-        """Return J, ``(*batch, 6, N)``: velocity and angular velocity of the tip's frame per v.
+        """Return J, ``(*batch, 6, N)``: J v is the velocity and angular velocity of the tip frame.
 
-        The velocity is that of the frame's origin; both are in the frame of the base.
+        Both are in the base frame. The velocity is that of the origin of the tip frame.
         """
         point = torch.nn.functional.pad(self.tip_position(q), (0, 1), value=1.0)
         reached = self._moved[:, self._tip_body] if self._tip_body >= 0 else 0 * self._moved[:, 0]
@@ -382,7 +401,7 @@ class RigidChain(MechanicalSystem):
         return torch.stack([points[..., starts, :], points[..., 1:, :]], dim=-2)
 
     def mass_matrix(self, q: Tensor, inertia: Tensor | None = None) -> Tensor:
-        """M(q), ``(*batch, N, N)``, with the bodies ``inertia``, the URDF's if None."""
+        """Return M(q), ``(*batch, N, N)``. ``inertia`` defaults to the bodies of the file."""
         self._check(q=q)
         at = self.kinematics(q)
         return self._mass(at, self._in_world(at, inertia))
@@ -394,11 +413,11 @@ class RigidChain(MechanicalSystem):
         return -matvec(bodies[..., :3, 3], self._gravity).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """D, ``(*batch, N, N)``, constant."""
+        """Return the constant matrix D, ``(*batch, N, N)``."""
         return torch.diag_embed(self._damping.expand_as(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """A = I: u are forces and torques at the joints."""
+        """Return A = I, ``(*batch, N, N)``: u holds the torques and forces at the joints."""
         return torch.eye(q.shape[-1]).to(q).expand(*q.shape, q.shape[-1])
 
     def _potential_force(self, q: Tensor) -> Tensor:
@@ -414,15 +433,24 @@ class RigidChain(MechanicalSystem):
         return (matrix @ values.flatten(-2)).unflatten(-1, (4, 4))
 
     def _mass(self, at: Kinematics, bodies: Tensor) -> Tensor:
+        # Composite-rigid-body algorithm (Featherstone 2008, sec. 6.2, table 6.2). Backward pass:
+        # composite body of each joint.
         composite = self._tree_sum(self._moved, bodies)
+        # Momentum of each composite body at unit speed of its joint, seen by the joints before it.
         momenta = (at.twists @ composite).flatten(-2)
         upper = at.twists.flatten(-2) @ momenta.mT * self._moved
         return self._of_coordinates(upper + upper.triu(1).mT)
 
     def _accelerations(self, at: Kinematics, v: Tensor, a: Tensor | None, pull: Tensor) -> Tensor:
-        """Xi' + Xi^2 - Gamma of every body, ``(*batch, B, 4, 4)``."""
+        """Return Xi' + Xi^2 - Gamma of every body, ``(*batch, B, 4, 4)``.
+
+        This is the forward pass of the recursive Newton-Euler algorithm (Featherstone 2008, sec.
+        5.3, table 5.1), with gravity as an acceleration of the base.
+        """
+        # Velocities of the bodies: sums over the joints that move them.
         joint_velocity = at.twists * self._of_joints(v)[..., None, None]
         velocity = self._tree_sum(self._moved.mT, joint_velocity)
+        # Accelerations of the bodies.
         change = _bracket(velocity, joint_velocity)
         if a is not None:
             change = change + at.twists * self._of_joints(a)[..., None, None]
@@ -430,16 +458,18 @@ class RigidChain(MechanicalSystem):
         return self._tree_sum(self._moved.mT, change) + velocity @ velocity - gravity
 
     def _force(self, at: Kinematics, accelerations: Tensor, bodies: Tensor) -> Tensor:
+        # Backward pass of the recursive Newton-Euler algorithm (Featherstone 2008, table 5.1):
+        # force on all bodies that a joint moves, projected onto the twist of the joint.
         forces = self._tree_sum(self._moved, accelerations @ bodies)
         tau = (at.twists * forces).sum((-2, -1))
         return tau @ self._coupling if self._coupled else tau
 
     def _of_joints(self, x: Tensor) -> Tensor:
-        """Return S x, ``(*batch, B)``, of coordinates ``(*batch, N)``."""
+        """Return S x, ``(*batch, B)``, for coordinates x ``(*batch, N)``."""
         return matvec(self._coupling, x) if self._coupled else x
 
     def _of_coordinates(self, matrix: Tensor) -> Tensor:
-        """Return S^T X S, ``(*batch, N, N)``, of a matrix of the joints ``(*batch, B, B)``."""
+        """Return S^T X S, ``(*batch, N, N)``, for a matrix X of the joints ``(*batch, B, B)``."""
         return self._coupling.mT @ matrix @ self._coupling if self._coupled else matrix
 
 
@@ -448,12 +478,12 @@ def _bracket(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _pairs(first: Tensor, second: Tensor) -> Tensor:
-    """<A_j, B_i> of all pairs, ``(*batch, N, N)``, row j, column i."""
+    """Return <A_j, B_i> in row j and column i, ``(*batch, B, B)``."""
     return first.flatten(-2) @ second.flatten(-2).mT
 
 
 def _screw_basis() -> Tensor:
-    """The 4 x 4 matrices of the six unit twists, ``(6, 4, 4)``: turns about x, y, z, and slides."""
+    """Return the 4 x 4 matrices of six unit twists: turns about and slides along x, y and z."""
     basis = torch.zeros(6, 4, 4, dtype=torch.float64)
     basis[:3, :3, :3] = cross_matrix(torch.eye(3))
     basis[3:, :3, 3] = torch.eye(3)

@@ -1,4 +1,4 @@
-"""Texts of robot files with identified constants: URDF and MJCF."""
+"""Write robot files with identified constants: URDF and MJCF."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class RobotConstants(NamedTuple):
         inertia: pseudo-inertias of the bodies in the frames of their joints, ``(B, 4, 4)``.
         armature, damping, friction: inertias of the rotors, viscous and dry friction, ``(N,)``.
         gain: force per input, zero for a passive joint, ``(N,)``.
-        bias: constant force, and force of the drive per q and per v, ``(N, 3)``.
-        limit: largest force of the drive without its constant, ``(N,)``.
+        bias: constant force of the drive, and its force per q and per v, ``(N, 3)``.
+        limit: largest force of the drive in addition to the constant force, ``(N,)``.
         stiffness, rest: stiffness and rest position of a spring of the joint, ``(N,)``.
-        notes: lines for a comment at the head of the file.
+        notes: lines of the comment at the top of the file.
     """
 
     inertia: Tensor
@@ -55,15 +55,15 @@ class RobotConstants(NamedTuple):
 
 
 def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
-    """Return the URDF of a robot with other inertias, damping and dry friction.
+    """Return the URDF of a robot with new inertias, damping and dry friction.
 
-    The ``<inertial>`` behind a joint is that of the body: the link and everything fixed to it. That
-    of the links fixed to it is zero. Joints that the robot locks become fixed joints. A URDF has no
-    field for armatures and springs, which are in the comment. The remainder is that of the robot's
-    file, or of the stored text if the file has changed. Meshes are relative to ``folder``.
+    The child link of a joint gets the ``<inertial>`` of its body; the links fixed to it get zero.
+    Locked joints become fixed joints. Armatures and springs, for which a URDF has no field, are
+    listed in a comment. All other elements are copied from the robot's file, or from the text
+    stored in the run if the file has changed. Meshes are relative to ``folder``.
     """
     file = _file(robot)
-    before = {behind: link for link, behind in file.ends.values()}
+    before = {child: parent for parent, child in file.ends.values()}
     bodies = central_parameters(constants.inertia)
     for name, link in file.links.items():
         body = name
@@ -73,7 +73,7 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
         if body not in robot.body_names or (body != name and is_frame):
             continue
         mass, *numbers = bodies[robot.body_names.index(body)].tolist()
-        if body != name:  # zero instead of nothing: MuJoCo would derive it from the shapes
+        if body != name:  # zero, since MuJoCo derives a missing inertia from the shapes
             mass, numbers = 0.0, 9 * [0.0]
             link.append(ET.Comment(f" in the inertia of {xml_comment(body)} "))
         _remove(link, "inertial")
@@ -85,12 +85,12 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
     locked = robot.tree.locked
     for name, joint in file.joints.items():
         if file.ends[name][1] in robot.body_names:
-            _remove(joint, "dynamics")  # that of a joint that follows another is in the other's
+            _remove(joint, "dynamics")  # the mimicked joint has that of its followers
         if name in robot.joint_names:
             _remove(joint, "mimic")
             k = robot.joint_names.index(name)
-            damping, friction = (repr(float(x[k])) for x in (constants.damping, constants.friction))
-            ET.SubElement(joint, "dynamics", damping=damping, friction=friction)
+            damping, friction = float(constants.damping[k]), float(constants.friction[k])
+            ET.SubElement(joint, "dynamics", damping=repr(damping), friction=repr(friction))
         elif joint.get("type") != "fixed" and file.ends[name][1] not in robot.body_names:
             driver, factor, offset = file.drive(name, (*robot.joint_names, *locked))
             position = offset + factor * locked.get(driver, 0.0)
@@ -108,15 +108,15 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
         if not os.path.isabs(name) and (file.path.parent / name).is_file():
             mesh.set("filename", os.path.relpath(file.path.parent / name, folder))
     _remove(file.robot, "note")
-    file.robot.set("name", file.robot.get("name") or "robot")  # readers refuse a robot without
+    file.robot.set("name", file.robot.get("name") or "robot")  # readers require a name
     return _written(file.robot, constants.notes)
 
 
 def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     """Return an MJCF of the bodies, joints and drives of a robot, without shapes.
 
-    An actuator computes gain * ctrl plus the bias, so that ctrl is the input of the model. The
-    force of an actuator has a hard limit. Equalities couple the joints that follow others.
+    An actuator computes gain * ctrl plus the bias, with the input of the model as ctrl, and has a
+    hard limit of its force. Equalities couple joints that mimic other joints.
     """
     file, tree = UrdfFile(robot.urdf), robot.tree
     names = {file.ends[name][1]: name for name in file.joints}
@@ -165,16 +165,19 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
 
 
 def _file(robot: RigidChain) -> UrdfFile:
-    """Return the robot's file if it is the same as in the training, or else the stored text."""
+    """Return the robot's file if it is unchanged since the training, or else the stored text."""
     urdf = robot.urdf
-    if urdf.startswith("<!-- "):  # a text of urdf_text
+    if urdf.startswith("<!-- "):  # text written by urdf_text
         path = html.unescape(urdf[5:].partition(" -->")[0])
         try:
             if not is_mjcf(path) and urdf_text(path) == urdf:
                 return UrdfFile(path)
         except (OSError, ValueError):
             pass
-        log.warning("%s is missing, has changed or is an MJCF: no shapes are written", path)
+        log.warning(
+            "%s is missing, changed after the training, or an MJCF: the new file has no shapes",
+            path,
+        )
     return UrdfFile(urdf)
 
 

@@ -1,4 +1,4 @@
-"""Frames of a bending segment, and of segments in a chain; Stumpff functions."""
+"""Frames of a bending segment and of segments in series; Stumpff functions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _TERMS = 16
 
 
 def stumpff(x: Tensor) -> tuple[Tensor, ...]:
-    """Stumpff functions c_0 ... c_6 of x = theta^2 >= 0, for theta up to 2 pi.
+    """Return the Stumpff functions c_0 ... c_6 of x = theta^2 >= 0, for theta up to 2 pi.
 
     ::
 
@@ -40,13 +40,13 @@ def stumpff(x: Tensor) -> tuple[Tensor, ...]:
 
 
 def first_slopes(c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """dc_1/dx, dc_2/dx, dc_3/dx from the values of :func:`stumpff`."""
+    """Return dc_1/dx, dc_2/dx, dc_3/dx from the values of :func:`stumpff`."""
     return 0.5 * (c[3] - c[2]), 0.5 * (2 * c[4] - c[3]), 0.5 * (3 * c[5] - c[4])
 
 
 def second_slopes(c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """d2c_1/dx2, d2c_2/dx2 from the values of :func:`stumpff`."""
-    return (0.25 * (3 * c[5] - 3 * c[4] + c[3]), 0.25 * (8 * c[6] - 5 * c[5] + c[4]))
+    """Return d2c_1/dx2, d2c_2/dx2 from the values of :func:`stumpff`."""
+    return 0.25 * (3 * c[5] - 3 * c[4] + c[3]), 0.25 * (8 * c[6] - 5 * c[5] + c[4])
 
 
 class Tip(NamedTuple):
@@ -61,9 +61,9 @@ class Tip(NamedTuple):
 
 
 def tip_rotation(q: Tensor, c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Rotation exp([w]x), w = (-dy, dx, 0), and the Jacobian of its angular velocity.
+    """Return the rotation exp([w]x), w = (-dy, dx, 0), and the Jacobian of its angular velocity.
 
-    omega = (I + c_2 [w]x + c_3 [w]x^2) dw/dt in the frame of the base.
+    The angular velocity is (I + c_2 [w]x + c_3 [w]x^2) dw/dt in the base frame.
     """
     dx, dy, _ = q.unbind(-1)
     w = torch.stack([-dy, dx, torch.zeros_like(dx)], dim=-1)
@@ -76,7 +76,7 @@ def tip_rotation(q: Tensor, c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
 
 
 def turning_bias(q: Tensor, v: Tensor, c: tuple[Tensor, ...], c2x: Tensor, c3x: Tensor) -> Tensor:
-    """d/dt of (I + c_2 [w]x + c_3 [w]x^2), times dw/dt: the bias of the angular acceleration."""
+    """Return d/dt(I + c_2 [w]x + c_3 [w]x^2) dw/dt, the bias of the angular acceleration."""
     dx, dy, _ = q.unbind(-1)
     vx, vy, _ = v.unbind(-1)
     zero = torch.zeros_like(dx)
@@ -102,7 +102,7 @@ def in_world(
     spin: Tensor,
     spin_bias: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Move one segment's kinematics from the frame of its base into the world frame."""
+    """Transform the kinematics of a segment from its base frame to the world frame."""
     rotation = base.rotation
     arm = r @ rotation.transpose(-1, -2)  # (*batch, S, 3)
     local = rotation.unsqueeze(-3) @ jac
@@ -132,7 +132,7 @@ def in_world(
 
 
 def cross_matrix(w: Tensor) -> Tensor:
-    """[w]x, ``(*batch, 3, 3)``, the matrix of the cross product with w ``(*batch, 3)``."""
+    """Return [w]x, ``(*batch, 3, 3)``, the matrix of the cross product with w ``(*batch, 3)``."""
     x, y, z = w.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

@@ -1,4 +1,4 @@
-"""An arm that a physics simulator moves, with the terms of the rigid chain of the same URDF."""
+"""An arm moved by a physics simulator, with the equation of motion of a rigid chain."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from pinn_dyn.systems.rigid_chain import RigidChain
 
 
 class World(Protocol):
-    """A simulation of one arm, where only gravity and the applied forces act.
+    """A simulation of one arm, on which only gravity and the applied forces act.
 
-    It has no joint motors, damping, friction, joint limits or contacts.
+    The simulation has no joint motors, damping, friction, joint limits or contacts.
 
     Args:
         text: the URDF of the arm.
@@ -52,15 +52,15 @@ class SimulatedArm(RigidChain):
 
     q ``(*batch, N)`` rad or m, v rad/s or m/s, u torques or forces ``(*batch, N)``, Nm or N.
 
-    A subclass states the ``simulator`` (a Python package), the command to ``install`` it, and the
-    class of its :class:`World`. Arms of the same URDF and gravity share a world: call
-    :meth:`set_state` before the steps of an arm.
+    A subclass defines the ``simulator`` (a Python package), the command to ``install`` it, and the
+    class of its :class:`World`. Arms with the same URDF and gravity share a world. Call
+    :meth:`set_state` before the steps of each arm.
 
     Args:
         urdf, locked_joints, gravity, tip, mass_scale, payload: arguments of :class:`RigidChain`.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
         v_max, u_max: limits of speed (rad/s or m/s) and torque or force, one number or N; None for
-            those of the file. An MJCF has no limits of speed.
+            the limits of the file. An MJCF has no limits of speed.
 
     Attributes:
         text: the URDF that the simulator loads.
@@ -71,8 +71,8 @@ class SimulatedArm(RigidChain):
         angles: indices of the joints that turn.
 
     Raises:
-        ImportError: without the simulator.
-        ValueError: as :class:`RigidChain`, or on a joint without limits or a body without mass.
+        ImportError: if the simulator is not installed.
+        ValueError: as :class:`RigidChain`, or if a joint has no limits or a body has no mass.
     """
 
     simulator: ClassVar[str]
@@ -124,13 +124,15 @@ class SimulatedArm(RigidChain):
                 )
         for body, mass in zip(self.body_names, self.inertia[:, 3, 3].tolist(), strict=True):
             if not mass > 0:
-                raise ValueError(f"link {body!r} moves with a mass of {mass} kg, expected more")
+                raise ValueError(
+                    f"link {body!r} moves with a mass of {mass} kg, expected a positive mass"
+                )
         self.gravity = tuple(float(g) for g in gravity)
         self.text = self.to_urdf()
         self.angles = tuple(k for k, turns in enumerate(self.turning) if turns)
 
     def set_state(self, q: np.ndarray, v: np.ndarray) -> None:
-        """Put the arm into a state, ``(N,)`` each, from which :meth:`step` moves it."""
+        """Set the state q, v, ``(N,)`` each, at which the next :meth:`step` starts."""
         self._world.put(q, v)
 
     def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -143,7 +145,7 @@ class SimulatedArm(RigidChain):
 
     @property
     def _world(self) -> World:
-        # The process is part of the key: a forked process must not use its parent's client.
+        # The cache key includes the process, since a fork must not use the client of its parent.
         return _open_world(os.getpid(), type(self).world, self.text, self.gravity)
 
     def motor_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -158,7 +160,7 @@ class SimulatedArm(RigidChain):
         return self._damping.double().cpu().numpy()
 
     def describe(self) -> dict[str, object]:
-        """Return everything that the motion depends on, JSON-serializable."""
+        """Return all values that determine the motion, JSON-serializable."""
         return {
             "urdf": hashlib.sha256(self.text.encode()).hexdigest(),
             "limits": self.limits.tolist(),
@@ -170,7 +172,7 @@ class SimulatedArm(RigidChain):
     def to_urdf(self) -> str:
         """Return a URDF with one link per body and without shapes, limits and friction.
 
-        Each inertia is given in its principal axes: PyBullet diagonalizes one to six digits only.
+        Inertias are written in their principal axes, since PyBullet diagonalizes only to 6 digits.
         """
         poses = self.kinematics(torch.zeros(self.num_coordinates, dtype=torch.float64)).poses
         weightless = '<mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
@@ -184,7 +186,7 @@ class SimulatedArm(RigidChain):
                 f'<joint name={quoteattr(name)} type="{kind}"><parent link="{_link(parent)}"/>'
                 f'<child link="{_link(k)}"/><origin xyz="{exact_text(origin)}"/>'
                 f'<axis xyz="{exact_text(axis)}"/>'
-                # PyBullet needs limits of a sliding joint; lower > upper means that there are none.
+                # PyBullet needs limits of a sliding joint; lower > upper means no limits.
                 '<limit lower="1" upper="-1" effort="0" velocity="0"/></joint>'
             )
             mass, centre, moments, turn = _principal_inertia(self.inertia[k].numpy(), rotation)
@@ -201,7 +203,7 @@ class SimulatedArm(RigidChain):
 def _principal_inertia(
     pseudo: np.ndarray, rotation: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray, scipy.spatial.transform.Rotation]:
-    """Return mass, centre, principal moments and principal axes of a body in a rotated frame."""
+    """Return mass, center, principal moments and principal axes of a body in a rotated frame."""
     mass = float(pseudo[3, 3])
     centre = pseudo[:3, 3] / mass
     second = pseudo[:3, :3] - mass * np.outer(centre, centre)

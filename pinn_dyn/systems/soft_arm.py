@@ -39,8 +39,8 @@ class SoftArm(MechanicalSystem):
         A = [A_1 ... A_n],  A_i = transposed Jacobian of (-omega_x, -omega_y, v_z) of tip i, in
                             its own frame: two bending torques in Nm and an axial force in N
 
-    The integrals are Gauss-Legendre sums; Stumpff functions take the place of every division by
-    theta. Bending up to theta = 2 pi per segment.
+    The integrals are Gauss-Legendre sums. Stumpff functions replace all divisions by theta. A
+    segment bends by up to theta = 2 pi.
 
     Source: paper, section Simulation Results, in the parametrization of Della Santina, Bicchi and
     Rus 2020 (IEEE RA-L 5(2)); the constants reproduce the paper's tables.
@@ -102,7 +102,7 @@ class SoftArm(MechanicalSystem):
         """Check that the equation of motion holds for all q from ``q_low`` to ``q_high``, ``(N,)``.
 
         Raises:
-            ValueError: if a segment has no length there, or bends by a whole turn.
+            ValueError: if a segment has no positive length, or bends by a full turn, in this range.
         """
         low, high = (np.asarray(q, dtype=float).reshape(-1, 3) for q in (q_low, q_high))
         bends = np.hypot(*np.maximum(np.abs(low), np.abs(high))[:, :2].T)
@@ -114,22 +114,22 @@ class SoftArm(MechanicalSystem):
                 )
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q) = sum_i mass_i int J^T J ds, ``(*batch, N, N)``."""
+        """Return M(q) = sum_i mass_i int J^T J ds, ``(*batch, N, N)``."""
         jacobian, _, _ = self._chain(q)
         return self._gram(jacobian)
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        """V(q) = stiffness^T q^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
+        """Return V(q) = stiffness^T q^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
         depths = self.backbone(q, self._s)[..., 2] @ self._weights.to(q)
         elastic = 0.5 * (self.stiffness.to(q) * q * q).sum(-1)
         return elastic - self.gravity * (depths @ self.mass.to(q))
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """D = diag(damping), ``(*batch, N, N)``."""
+        """Return D = diag(damping), ``(*batch, N, N)``."""
         return torch.diag_embed(self.damping.to(q).expand_as(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """A(q) = [A_1 ... A_n], ``(*batch, N, 3 n)``."""
+        """Return A(q) = [A_1 ... A_n], ``(*batch, N, 3 n)``."""
         _, _, tips = self._chain(q, nodes=self._s[:0])
         columns = []
         for tip in tips:
@@ -138,15 +138,15 @@ class SoftArm(MechanicalSystem):
         return torch.stack(columns, dim=-1)
 
     def tip_position(self, q: Tensor) -> Tensor:
-        """Return the world position of the arm's tip, ``(*batch, 3)``, m."""
+        """Return the position of the tip in the world frame, ``(*batch, 3)``, m."""
         return self.backbone(q, q.new_ones(1))[..., -1, 0, :]
 
     def lines(self, q: Tensor) -> Tensor:
-        """Return the backbone, a line of 21 points per segment, ``(*batch, n, 21, 3)``, m."""
+        """Return the backbone as lines of 21 points, ``(*batch, n, 21, 3)``, m."""
         return self.backbone(q, torch.linspace(0, 1, 21, dtype=q.dtype, device=q.device))
 
     def backbone(self, q: Tensor, s: Tensor) -> Tensor:
-        """Return points at the fractions s ``(S,)`` of all segments, ``(*batch, n, S, 3)``, m."""
+        """Return points at the fractions s ``(S,)`` of each segment, ``(*batch, n, S, 3)``, m."""
         position = q.new_zeros((*q.shape[:-1], 3))
         rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
         segments = []
@@ -159,7 +159,7 @@ class SoftArm(MechanicalSystem):
             rotation = rotation @ turn
         return torch.stack(segments, dim=-3)
 
-    # For point masses C(q, v) v = sum m J^T (dJ/dt) v, which needs no derivative of M.
+    # For point masses, C(q, v) v = sum m J^T (dJ/dt) v needs no derivative of M.
 
     def _potential_force(self, q: Tensor) -> Tensor:
         jacobian, _, _ = self._chain(q)
@@ -194,7 +194,7 @@ class SoftArm(MechanicalSystem):
     def _chain(
         self, q: Tensor, v: Tensor | None = None, nodes: Tensor | None = None
     ) -> tuple[Tensor, Tensor, list[Tip]]:
-        """Return dr/dq ``(*batch, S, 3, N)``, (d/dt dr/dq) v and tip frames, S = points."""
+        """Return dr/dq ``(*batch, S, 3, N)`` at S points, (d/dt dr/dq) v, and the tip frames."""
         batch, size = q.shape[:-1], self.num_coordinates
         s = (self._s if nodes is None else nodes).to(q)
         ends = torch.cat([s, s.new_ones(1)])
@@ -223,18 +223,19 @@ class SoftArm(MechanicalSystem):
     def _segment(
         self, q: Tensor, v: Tensor | None, s: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the kinematics of one segment in the frame of its base.
+        """Return the kinematics of one segment in its base frame.
 
-        These are r ``(*batch, S, 3)``, its Jacobian ``(*batch, S, 3, 3)`` and bias (dJ/dt) v
-        ``(*batch, S, 3)`` at the points ``s`` (the last one is the tip); the tip's rotation
-        ``(*batch, 3, 3)``, Jacobian of the angular velocity ``(*batch, 3, 3)`` and its bias.
+        These are, at the points ``s`` (the last point is the tip), r ``(*batch, S, 3)``, its
+        Jacobian ``(*batch, S, 3, 3)`` and bias (dJ/dt) v ``(*batch, S, 3)``; and, at the tip, the
+        rotation ``(*batch, 3, 3)``, the Jacobian of the angular velocity ``(*batch, 3, 3)`` and its
+        bias ``(*batch, 3)``.
         """
         dx, dy, dl = (x.unsqueeze(-1) for x in q.unbind(-1))
         length = self.length + dl
         square = dx * dx + dy * dy
         c = stumpff(square * s * s)
         c1x, c2x, c3x = first_slopes(c)
-        # r = L [dx F, dy F, E] with F, E functions of theta^2 and their slopes.
+        # r = L [dx F, dy F, E] with functions F (bend) and E (reach) of theta^2, and their slopes.
         s2 = s * s
         bend, reach = s2 * c[2], s * c[1]
         bend_x, reach_x = s2 * s2 * c2x, s2 * s * c1x

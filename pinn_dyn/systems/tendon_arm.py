@@ -1,4 +1,4 @@
-"""A soft arm that motors bend by tendons, with the positions of the motors as inputs."""
+"""A soft arm bent by tendons, with the positions of their motors as inputs."""
 
 from __future__ import annotations
 
@@ -97,14 +97,14 @@ class TendonArm(SoftArm):
         self.register_buffer("routing", torch.kron(upstream, torch.stack(lengths, -1)))
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        """V(q) of the arm and of the tendons at u = 0, ``(*batch,)``."""
+        """Return V(q) of the arm and of the tendons at u = 0, ``(*batch,)``."""
         s, w = self._stretch(q, 0.0), self.slack
         root = (s * s + w * w).sqrt()
         energy = self.tendon_stiffness.to(q) / 4 * (s * s + s * root + w * w * (s / w).asinh())
         return super().potential_energy(q) + energy.sum(-1)
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """A(q) = df/du at u = 0, ``(*batch, 3 n, M)``."""
+        """Return A(q) = df/du at u = 0, ``(*batch, 3 n, M)``."""
         s = self._stretch(q, 0.0)
         slope = 0.5 * self.tendon_stiffness.to(q) * (1 + s / (s * s + self.slack**2).sqrt())
         return -self.spool * self.routing.to(q).mT * slope.unsqueeze(-2)
@@ -115,7 +115,7 @@ class TendonArm(SoftArm):
         return angles if self.num_inputs == self.num_coordinates else 0 * angles
 
     def tensions(self, q: Tensor, u: Tensor | float) -> Tensor:
-        """Return T, ``(*batch, M)``, N."""
+        """Return the tensions T, ``(*batch, M)``, N."""
         s = self._stretch(q, u)
         return 0.5 * self.tendon_stiffness.to(s) * (s + (s * s + self.slack**2).sqrt())
 

@@ -20,29 +20,29 @@ _UNREAD = {"visual", "collision", "material", "transmission", "gazebo"}
 class Tree(NamedTuple):
     """N coordinates, and the B joints that they move, each with one rigid body.
 
-    A body is a link and everything fixed to it. Joint k moves by ``coupling[k] @ q``: a joint that
-    mimics another follows the coordinate of that joint.
+    A body is a link with all links fixed to it. Joint k moves by ``coupling[k] @ q``: a joint that
+    mimics another joint follows the coordinate of that joint.
 
     Attributes:
         path: the file.
         joints: names of the joints whose positions are the coordinates.
         movable: names of all joints that can be coordinates.
         locked: positions of the locked joints by name.
-        bodies: names of the links behind the B joints.
-        parents: index of the joint before each joint, -1 at the base; parents come first.
+        bodies: names of the child links of the B joints.
+        parents: index of the parent joint of each joint, -1 at the base; parents come first.
         placements: pose of each joint's frame at q = 0 in its parent's frame, ``(B, 4, 4)``.
         axes: unit axis of each joint in its own frame, ``(B, 3)``.
         revolute: true for a joint that turns, false for a joint that slides, ``(B,)``.
-        turning: the same of the coordinates, N.
-        coupling: motion of the joints by the coordinates, ``(B, N)``.
+        turning: true for a coordinate that turns, false for a coordinate that slides, N.
+        coupling: motion of the joints per motion of the coordinates, ``(B, N)``.
         inertia: pseudo-inertia of each body in its joint's frame, ``(B, 4, 4)``; kg, kg m, kg m^2.
         limits: lower and upper position, speed and effort of each coordinate, ``(N, 4)``; zero
-            where the URDF has none, a position of -pi to pi for a continuous joint.
+            where the URDF has no limit, and positions -pi to pi for a continuous joint.
         tip_body: index of the body that carries the tip, -1 for the base.
         tip_pose: pose of the tip in that body's frame, ``(4, 4)``.
         held: joints that cannot be coordinates, with their types.
         unread: effects of an MJCF that the model leaves out, such as springs.
-        problems: masses and inertias of moving links that no body has.
+        problems: masses and inertias of moving links that are physically impossible.
     """
 
     path: Path
@@ -74,13 +74,13 @@ def read_urdf(
     mass_scale: float = 1.0,
     payload: float = 0.0,
 ) -> Tree:
-    """Read a URDF or an MJCF; arguments as of :class:`~pinn_dyn.systems.RigidChain`.
+    """Read a URDF or an MJCF. The arguments are those of :class:`~pinn_dyn.systems.RigidChain`.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ImportError: on an MJCF without MuJoCo.
-        ValueError: on text that is no URDF of a tree of links, an unknown joint or tip, or no joint
-            that moves.
+        FileNotFoundError: if the file does not exist.
+        ImportError: if the file is an MJCF and MuJoCo is not installed.
+        ValueError: if the text is not the URDF of a tree of links, a joint or the tip is unknown,
+            or no joint moves.
     """
     file = UrdfFile(urdf)
     joints, movable, locked = _joints(file, joints, locked_joints)
@@ -88,7 +88,7 @@ def read_urdf(
     if tip is None:
         tip = [name for name in children if not file.after(name)][-1]
     if tip not in children:
-        raise ValueError(f"{file.path}: tip is {tip!r}, expected a link behind a joint: {children}")
+        raise ValueError(f"{file.path}: tip is {tip!r}, expected a child link: {children}")
     moving: list[str] = []
     parents: list[int] = []
     placements: list[np.ndarray] = []
@@ -97,7 +97,7 @@ def read_urdf(
     visited: dict[str, tuple[int, np.ndarray]] = {}
 
     def visit(link: str, body: int, pose: np.ndarray) -> None:
-        """Add a link, at ``pose`` in the frame of the joint ``body``, and all links behind it."""
+        """Add a link, at ``pose`` in the frame of the joint ``body``, and its descendants."""
         visited[link] = body, pose
         if body >= 0:
             inertia[body] += mass_scale * pose @ file.pseudo_inertia(link) @ pose.T
@@ -147,7 +147,7 @@ def _joints(
     joints: Sequence[str] | None,
     locked_joints: Sequence[str] | Mapping[str, float],
 ) -> tuple[list[str], list[str], dict[str, float]]:
-    """Return the joints of the coordinates, all that move, and the values of locked joints."""
+    """Return the joints of the coordinates, all movable joints, and positions of locked joints."""
     locked = dict.fromkeys(locked_joints, 0.0)
     locked |= locked_joints if isinstance(locked_joints, Mapping) else {}
     movable = [name for name in file.order if file.moves(name) and name not in locked]
@@ -155,16 +155,18 @@ def _joints(
         joints = [name for name in movable if file.drive(name)[0] == name]
     for key, names, allowed in (("locked_joints", locked, file.order), ("joints", joints, movable)):
         if wrong := [name for name in names if name not in allowed or [*names].count(name) > 1]:
-            raise ValueError(f"{file.path}: {key} has {wrong}, expected once each of {allowed}")
+            raise ValueError(
+                f"{file.path}: {key} has {wrong}, expected different names out of {allowed}"
+            )
     if not joints:
         raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked)})")
     return list(joints), movable, locked
 
 
 def urdf_text(urdf: str) -> str:
-    """Return a robot file as the text of a URDF without shapes, behind a comment with its path.
+    """Return a robot file as a URDF without shapes, after a comment with its path.
 
-    Keep the text of a URDF as it is.
+    A robot that is given as the text of a URDF is returned unchanged.
 
     Raises:
         FileNotFoundError, ImportError, ValueError: as :func:`read_urdf`.

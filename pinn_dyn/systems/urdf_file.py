@@ -1,4 +1,4 @@
-"""Links and joints of a robot file by name, and their numbers."""
+"""Read the links and joints of a robot file."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from pinn_dyn.systems.mjcf import mjcf_to_urdf
 
 TEXT = "URDF text"
 """Path of a URDF that was passed as text."""
-_DEFINITIONS = ("arg", "include", "macro", "property")  # of xacro
+_DEFINITIONS = ("arg", "include", "macro", "property")  # tags of xacro
 _TURNING = ("revolute", "continuous")
 _MOVING = (*_TURNING, "prismatic")
 _HELD = ("floating", "planar", "spherical")
-_TOLERANCE = 1e-6  # of the largest principal moment of inertia
+_TOLERANCE = 1e-6  # error of moments of inertia, relative to the largest principal moment
 _ROUNDING = 1e-12  # kg m^2
 
 
@@ -35,16 +35,16 @@ class UrdfFile:
         path: the file.
         robot: its XML without namespaces.
         links, joints: elements by name.
-        ends: names of the links before and behind each joint.
+        ends: names of the parent and child links of each joint.
         axes: unit axes of the joints that move.
         roots: links without a parent.
         order: names of the joints, depth first.
-        problems: masses and inertias that no body has, of the links that were read.
+        problems: masses and inertias that are physically impossible, of the links read so far.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is no URDF, its links and joints form no tree, or a number that
-            places them is missing. The message lists all mistakes.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is not a URDF, its links and joints are not a tree, or a number of
+            their poses is missing. The message lists all mistakes.
     """
 
     def __init__(self, urdf: str):
@@ -54,9 +54,10 @@ class UrdfFile:
         self.links = self._by_name("link", mistakes)
         self.joints = self._by_name("joint", mistakes)
         self.ends = {name: _ends(joint) for name, joint in self.joints.items()}
-        if undefined := {end for pair in self.ends.values() for end in pair} - self.links.keys():
+        linked = set[str]().union(*self.ends.values())
+        if undefined := linked - self.links.keys():
             mistakes.append(f"joints name the links {sorted(undefined)}, which are not defined")
-        children = Counter(behind for _, behind in self.ends.values())
+        children = Counter(child for _, child in self.ends.values())
         if shared := [name for name, count in children.items() if count > 1]:
             mistakes.append(f"the links {shared} have several parents, expected a tree")
         self._poses: dict[str, np.ndarray] = {}
@@ -65,10 +66,13 @@ class UrdfFile:
         for name, joint in self.joints.items():
             self._read_joint(name, joint, mistakes)
         self.roots = [name for name in self.links if name not in children]
-        self.order = [] if shared else [x for root in self.roots for x in self._behind(root)]
-        reached = {self.ends[name][1] for name in self.order}
-        if not shared and (circle := sorted(children.keys() - reached)):
-            mistakes.append(f"no joints lead from a base to the links {circle}")
+        self.order: list[str] = []
+        if not shared:
+            for root in self.roots:
+                self.order += self._descendants(root)
+            reached = {self.ends[name][1] for name in self.order}
+            if circle := sorted(children.keys() - reached):
+                mistakes.append(f"no joints lead from a base to the links {circle}")
         if mistakes:
             more = f"; and {len(mistakes) - 10} more" if len(mistakes) > 10 else ""
             raise ValueError(f"{self.path}: {'; '.join(mistakes[:10])}{more}")
@@ -98,21 +102,23 @@ class UrdfFile:
         self.axes[name] = axis / max(length, 1e-300)
         mimic = joint.find("mimic")
         if mimic is not None and mimic.get("joint") in self.joints:
-            keys = (("multiplier", "1"), ("offset", "0"))
-            numbers = (_numbers(name, joint, "mimic", *key, mistakes)[0] for key in keys)
-            self._mimics[name] = (mimic.get("joint", ""), *map(float, numbers))  # type: ignore[assignment]
+            factor = _numbers(name, joint, "mimic", "multiplier", "1", mistakes)[0]
+            offset = _numbers(name, joint, "mimic", "offset", "0", mistakes)[0]
+            self._mimics[name] = (mimic.get("joint", ""), float(factor), float(offset))
 
-    def _behind(self, link: str) -> list[str]:
-        """Return the names of all joints behind a link, depth first."""
-        names = self.after(link)
-        return [x for name in names for x in (name, *self._behind(self.ends[name][1]))]
+    def _descendants(self, link: str) -> list[str]:
+        """Return the names of all joints after a link, depth first."""
+        names = []
+        for name in self.after(link):
+            names += [name, *self._descendants(self.ends[name][1])]
+        return names
 
     def after(self, link: str) -> list[str]:
-        """Return the names of the joints on a link."""
-        return [name for name, (before, _) in self.ends.items() if before == link]
+        """Return the names of the joints whose parent is a link."""
+        return [name for name, (parent, _) in self.ends.items() if parent == link]
 
     def moves(self, name: str) -> bool:
-        """Return true for a joint of one coordinate."""
+        """Return true for a joint with one coordinate."""
         return self.joints[name].get("type") in _MOVING
 
     def turns(self, name: str) -> bool:
@@ -120,12 +126,13 @@ class UrdfFile:
         return self.joints[name].get("type") in _TURNING
 
     def drive(self, name: str, stops: Collection[str] = ()) -> tuple[str, float, float]:
-        """Return the joint that a joint mimics, with factor and offset of the motion.
+        """Return the joint that drives a joint, with factor and offset of the motion.
 
-        A joint in ``stops`` and a joint that mimics no other drive themselves.
+        This is the end of the chain of mimicked joints, or the first joint of it in ``stops``. A
+        joint that mimics no joint drives itself.
         """
         factor, offset = 1.0, 0.0
-        for _ in self.joints:  # joints may mimic each other in a circle
+        for _ in self.joints:  # ends even if joints mimic each other in a circle
             if name in stops or name not in self._mimics:
                 break
             name, multiplier, shift = self._mimics[name]
@@ -135,12 +142,12 @@ class UrdfFile:
 
     @property
     def held(self) -> list[str]:
-        """Names and types of the joints of several coordinates."""
+        """Names and types of the joints with several coordinates."""
         kinds = {name: self.joints[name].get("type") for name in self.order}
         return [f"{name} ({kind})" for name, kind in kinds.items() if kind in _HELD]
 
     def pose(self, name: str, position: float = 0.0) -> np.ndarray:
-        """Return the pose of the link behind a joint in the link before it, ``(4, 4)``."""
+        """Return the pose of the child link of a joint in its parent link, ``(4, 4)``."""
         motion = np.eye(4)
         if name not in self.axes:
             position = 0.0
@@ -153,7 +160,7 @@ class UrdfFile:
         return self._poses[name] @ motion
 
     def limits(self, name: str) -> list[float]:
-        """Return lower and upper position, speed and effort of a joint, zero where unreadable."""
+        """Return the limits of a joint: lower, upper, velocity, effort; zero where unreadable."""
         joint = self.joints[name]
         keys = ("lower", "upper", "velocity", "effort")
         low, high, *limits = (float(_numbers(name, joint, "limit", x, "0", [])[0]) for x in keys)
@@ -162,7 +169,7 @@ class UrdfFile:
         return [low, high, *limits]
 
     def pseudo_inertia(self, name: str) -> np.ndarray:
-        """Return J of a link in its frame, ``(4, 4)``; zero for a mere frame."""
+        """Return J of a link in its frame, ``(4, 4)``; zero for a link without ``<inertial>``."""
         inertial = self.links[name].find("inertial")
         if inertial is None:
             return np.zeros((4, 4))
@@ -177,8 +184,8 @@ class UrdfFile:
         if mass < 0 or moments[0] < -slack or moments[2] > min(limit, sum(moments[:2])) + slack:
             mistakes.append(
                 f"link {name!r} has mass {mass:g} kg and moments {moments.tolist()} kg m^2, "
-                "expected none negative, no moment larger than the sum of the other two, and none "
-                "of a body of 10 m or more (units: kg, m)"
+                "expected no negative number, no moment larger than the sum of the other two, and "
+                "no body of 10 m or more (units: kg, m)"
             )
         pose = _pose(name, inertial, mistakes)
         self.problems += mistakes
@@ -187,7 +194,7 @@ class UrdfFile:
 
 
 def is_text(urdf: str) -> bool:
-    """Return true for the text of a file, false for a path."""
+    """Return true for the text of a robot file, false for its path."""
     return urdf.lstrip("\ufeff \r\n\t").startswith("<")
 
 
@@ -200,13 +207,13 @@ def is_mjcf(urdf: str) -> bool:
 
 
 def _ends(joint: ET.Element) -> tuple[str, str]:
-    before, behind = joint.find("parent"), joint.find("child")
-    names = ["" if end is None else end.get("link", "") for end in (before, behind)]
+    parent, child = joint.find("parent"), joint.find("child")
+    names = ["" if end is None else end.get("link", "") for end in (parent, child)]
     return names[0], names[1]
 
 
 def _pose(name: str, element: ET.Element, mistakes: list[str]) -> np.ndarray:
-    """Return the ``<origin>`` of a joint or an ``<inertial>``, ``(4, 4)``."""
+    """Return the pose in the ``<origin>`` of a joint or an ``<inertial>``, ``(4, 4)``."""
     pose = np.eye(4)
     rpy = _numbers(name, element, "origin", "rpy", "0 0 0", mistakes)
     pose[:3, :3] = scipy.spatial.transform.Rotation.from_euler("xyz", rpy).as_matrix()
@@ -217,7 +224,7 @@ def _pose(name: str, element: ET.Element, mistakes: list[str]) -> np.ndarray:
 def _numbers(
     name: str, element: ET.Element, tag: str, key: str, default: str, mistakes: list[str]
 ) -> np.ndarray:
-    """Return the numbers of an attribute, as many as the default has, or the default."""
+    """Return the numbers of an attribute, or the default if their count is not that of it."""
     usual = np.array((default or "0").split(), dtype=float)
     child = element.find(tag)
     text = default if child is None else child.get(key, default)
@@ -237,7 +244,7 @@ def _read(urdf: str) -> tuple[Path, ET.Element]:
     if root.tag == "mujoco":
         root = ET.fromstring(mjcf_to_urdf(urdf if is_text(urdf) else path))
         path = Path("MJCF text") if is_text(urdf) else path
-    if root.find("{*}link") is not None:  # definitions that are left over add no link
+    if root.find("{*}link") is not None:  # remaining definitions of xacro add no links
         for child in [x for x in root if "xacro" in x.tag and x.tag.endswith(_DEFINITIONS)]:
             root.remove(child)
     if any("xacro" in x.tag or "${" in "".join(x.attrib.values()) for x in root.iter()):
@@ -262,7 +269,7 @@ def _content(urdf: str) -> tuple[Path, ET.Element]:
     path, content = (Path(TEXT), urdf.encode()) if is_text(urdf) else _open(urdf)
     try:
         return path, _parse(content)
-    except (ET.ParseError, LookupError, ValueError) as error:  # also unknown encodings
+    except (ET.ParseError, LookupError, ValueError) as error:  # LookupError: unknown encoding
         page = ": it is a web page" if b"<html" in content[:2000].lower() else ""
         raise ValueError(f"{path} is not valid XML for a URDF: {error}{page}") from error
 
@@ -280,7 +287,7 @@ def _open(urdf: str) -> tuple[Path, bytes]:
 
 
 def _parse(content: bytes) -> ET.Element:
-    """Parse XML, also with another encoding than it states, or undeclared prefixes."""
+    """Parse XML, also if its declared encoding is wrong or its prefixes are undeclared."""
     try:
         return ET.fromstring(content)
     except (ET.ParseError, LookupError, ValueError):

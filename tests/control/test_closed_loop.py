@@ -74,7 +74,7 @@ def test_the_period_and_the_limits_of_a_pipeline_are_those_of_the_loop():
     torch.testing.assert_close(sampled(controller=pipeline).u, expected.u, rtol=0, atol=1e-9)
     with pytest.raises(ValueError, match=r"period of the pipeline is 0.01 s, expected 0.02 s"):
         sampled(controller=Pipeline(PD(), 0.01))
-    with pytest.raises(ValueError, match="actuator: a pipeline has its own limits"):
+    with pytest.raises(ValueError, match="actuator: the controller is a pipeline"):
         sampled(controller=pipeline, actuator=Actuator(low=0.0))
 
 

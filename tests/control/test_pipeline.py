@@ -231,7 +231,7 @@ def test_a_guard_falls_back_outside_the_data(region, fallback):
 
 
 def test_a_guard_without_stiffness_refuses_the_fall_back_to_regulation(region):
-    with pytest.raises(ValueError, match="ComputedTorque have other units: use the fallback hold"):
+    with pytest.raises(ValueError, match="ComputedTorque have other units: use fallback=hold"):
         Guarded(ComputedTorque(pendulums(), 1.0, 1.0), region, fallback="regulation")
 
 

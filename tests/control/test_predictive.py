@@ -222,7 +222,7 @@ def test_limits_and_references_that_are_not_numbers_are_named():
 def test_values_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match="v_max is"):
         PredictiveControl(pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
-    with pytest.raises(ValueError, match="expected two steps"):
+    with pytest.raises(ValueError, match="expected at least two steps"):
         PredictiveControl(pendulum(), 0.05, STEP)
     with pytest.raises(ValueError, match=r"q_low\[0\] is 1, which exceeds q_high\[0\], 0.5"):
         PredictiveControl(pendulum(), 0.6, STEP, q_low=1.0, q_high=0.5)

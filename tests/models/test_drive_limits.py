@@ -253,7 +253,7 @@ def test_the_check_of_a_log_names_a_drive_that_saturates(motions):
 def test_wrong_limits_are_refused():
     with pytest.raises(ValueError, match="stall and no_load_speed together"):
         DriveLimits(unit_scales(1), stall=3.0)
-    with pytest.raises(ValueError, match="a loss by load needs known drives"):
+    with pytest.raises(ValueError, match="friction with a loss by load needs known drives"):
         make_structured("lnn", friction=LoadDependent)
     with pytest.raises(ValueError, match=r"leave out model\.limits"):
         KnownMechanics(statistics(1), RigidChain(ARM), limits=DC, input=Servo)

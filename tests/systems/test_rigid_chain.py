@@ -243,7 +243,7 @@ def test_joints_that_are_not_named_are_locked():
     q, v, a = states(2)
     assert_same(chain.rigid_force(q, v, a), other.rigid_force(q, v, a))
     with pytest.raises(
-        ValueError, match=r"joints has \['elbow'\], expected once each of \['turn', "
+        ValueError, match=r"joints has \['elbow'\], expected different names out of \['turn', "
     ):
         RigidChain(TREE, joints=["turn", "elbow"])
 

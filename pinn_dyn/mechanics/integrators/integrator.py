@@ -44,7 +44,7 @@ class Integrator(abc.ABC):
     Attributes:
         nodes: times of the stages in a step, from 0 to 1.
         order: exponent of the error O(h^order).
-        mean_input: true to shift the inputs at the nodes so that their mean is that over the step.
+        mean_input: true to shift the inputs at the nodes to the mean input over the step.
         implicit: true for a method that is stable where damping outweighs inertia.
     """
 
@@ -71,7 +71,7 @@ class Integrator(abc.ABC):
         """
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        """Return increments ``(T, *batch, S)`` at the ends of the steps, the grid ``(T,)``."""
+        """Return increments ``(T, *batch, S)`` at the grid ``(T,)``, the ends of the steps."""
         blocks = [torch.zeros_like(start)[None]]
         for inputs, lengths in self.blocks(grid, signal):
             steps = []
@@ -85,7 +85,7 @@ class Integrator(abc.ABC):
     def blocks(
         self, grid: Tensor, signal: Signal, size: int = BLOCK
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield inputs ``(n, stages, *batch, M)`` and lengths ``(n,)`` of n <= ``size`` steps."""
+        """Yield inputs ``(n, stages, *batch, M)`` and lengths ``(n,)`` of up to ``size`` steps."""
         lengths = grid.diff()
         means = signal.means(grid) if self.mean_input else None
         for begin in range(0, grid.shape[0] - 1, size):

@@ -23,8 +23,8 @@ class Rosenbrock(Integrator):
     Hundsdorfer (1999), "A second-order Rosenbrock method applied to photochemical dispersion
     problems".
 
-    With the mean m of u over the step, both stages use ``u + m - (u(t) + u(t + h))/2``, so that no
-    impulse of the input between the stages is lost.
+    With the mean m of u over the step, both stages use ``u + m - (u(t) + u(t + h))/2``. This keeps
+    impulses of the input between the stages.
     """
 
     nodes = (0.0, 1.0)

@@ -11,14 +11,14 @@ from pinn_dyn.mechanics.integrators.rk4 import RK4
 
 
 class Sticking(Integrator):
-    """Method whose steps integrate the dynamics of :class:`~.sliding.Sliding`.
+    """Integrator of systems with sticking friction, see :class:`~.sliding.Sliding`.
 
-    The order is that of the inner method while no coordinate stops or starts, and otherwise 2. It
-    is 1 if a coordinate starts because of the stop of another coordinate. A coordinate at rest
-    under a load below its friction level does not move at all.
+    The order is that of the inner method while no coordinate stops or starts to move, otherwise
+    2. If the stop of a coordinate sets another coordinate in motion, the order is 1. A coordinate
+    at rest under a load below its friction level does not move at all.
 
     Args:
-        inner: the method that integrates these dynamics.
+        inner: integration method of the motion in a step.
     """
 
     def __init__(self, inner: Integrator):
