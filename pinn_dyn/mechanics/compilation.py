@@ -25,7 +25,7 @@ STEPS_FOR_DERIVATIVE = 5_000
 33 s at batch 256 and N = 3."""
 STEPS_FOR_PROGRAM = 20_000
 """Training steps from which compiling loss and gradient as one program pays off: another 4 ms per
-step for 54 s at N = 3 and 124 s at N = 7. For ensembles it always pays off."""
+step for 54 s at N = 3 and 124 s at N = 7."""
 MOST_EVALUATIONS = 4
 """Largest number of evaluations of the dynamics in a window that is compiled as one program."""
 CHUNK = 256
