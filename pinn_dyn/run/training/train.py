@@ -27,6 +27,8 @@ from pinn_dyn.models import (
     AccelerationMLP,
     CoupledOscillators,
     HamiltonianNetwork,
+    KnownMechanics,
+    KnownSystem,
     LagrangianNetwork,
     NextStateMLP,
     SubspaceEncoder,
@@ -164,6 +166,8 @@ def train(
         model, trainer = _with_defaults(model, on_log), {**usual, **trainer}
     if least_squares:
         check_trainer(trainer)
+    elif _factory(model) in (KnownMechanics, KnownSystem):
+        log.info("optimizer=least_squares (in Python LeastSquares()) fits constants in seconds")
     data = data or partial(DynamicsData, **section(values, "data"), history=_history(model))
     optimizer = optimizer or partial(AdamW, **section(values, "optimizer"))
     losses = {"increment": partial(IncrementLoss, **section(values, "loss"))}
