@@ -44,7 +44,9 @@ def check(cfg: DictConfig) -> None:
     if not report.problems:
         _print_commands(report, structure)
     if report.problems:
-        raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")
+        raise ConfigError(
+            f"{source.name}: the log is not suitable for training: {'; '.join(report.problems)}"
+        )
 
 
 def _print_commands(report: LogCheck, structure: Structure | None) -> None:
@@ -92,7 +94,7 @@ def _training(options: Sequence[str], with_structure: bool = False) -> str:
     The command identifies the structure that the check was called with, if ``with_structure``.
     """
     parts = shlex.split(command_line())
-    program = Path(parts.pop(parts[0] == "python"))  # behind the name of the interpreter
+    program = Path(parts.pop(parts[0] == "python"))  # after the name of the interpreter
     dropped = ("hydra.", "longest_delay=") + (() if with_structure else ("model",))
     parts = [x for x in parts if not x.startswith(dropped)]
     name = program.with_name(program.name.replace("check", "train"))

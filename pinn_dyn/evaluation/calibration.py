@@ -47,10 +47,10 @@ class Calibration:
 
 
 def half_widths(members: int, level: float | np.ndarray = LEVEL) -> np.ndarray:
-    """Return half the width of an interval in standard deviations sqrt(1 + 1/E) s of E members.
+    """Return the half width of intervals in units of sqrt(1 + 1/E) s, with the spread s.
 
-    The width is the quantile of Student's t with E - 1 degrees of freedom. A further member, and
-    so the truth if it is distributed like the members, lies within.
+    It is the quantile of Student's t with E - 1 degrees of freedom. The interval contains the truth
+    with the nominal probability if the truth is distributed like the E members.
     """
     return np.asarray(scipy.stats.t.ppf(0.5 + 0.5 * np.asarray(level), members - 1))
 

@@ -39,8 +39,8 @@ class ExternalTorque:
     Attributes:
         table: a row per sample: the time in s, ``run``, for each joint the torque of the drive
             (``measured``), of the motion (``model``), and their difference (``external``), all
-            behind the low-pass of the observer, N or Nm; and ``contact``. With a link, its force
-            ``fx fy fz`` in N and moment ``mx my mz`` in Nm in the frame of the base, and
+            after the low-pass filter of the observer, N or Nm; and ``contact``. With a link, its
+            force ``fx fy fz`` in N and moment ``mx my mz`` in Nm in the frame of the base, and
             ``ambiguous``, true where the joints cannot tell a part of the force.
         threshold: largest external torque of each joint without a contact, N or Nm.
         contacts: a row per contact: run, start and end in s, the joint that exceeds its threshold
@@ -115,10 +115,10 @@ def settled(residual: Tensor, step: float, bandwidth: float) -> Tensor:
 
 
 def quiet_level(sizes: Tensor, threshold: np.ndarray) -> float:
-    """Return the ratio to the thresholds that |r| of a quarter of the moving samples stays below.
+    """Return the lower quartile of max_i |r_i| / threshold_i over the samples in motion.
 
-    It compares a frame with contacts to quiet motion, as long as they are no longer than three
-    quarters of the frame.
+    The quartile belongs to motion without contact if contacts last less than three quarters of the
+    frame.
     """
     ratios = (sizes / torch.from_numpy(threshold)).amax(dim=1)
     return float(np.quantile(ratios[ratios > 0], _QUIET)) if ratios.any() else 0.0
@@ -127,7 +127,7 @@ def quiet_level(sizes: Tensor, threshold: np.ndarray) -> float:
 def contact_thresholds(
     quiet: Sequence[Tensor], step: float, bandwidth: float, false_alarms: float
 ) -> np.ndarray:
-    """Return the level of |r| of each joint that quiet motion exceeds rarely, ``(N,)``.
+    """Return the contact threshold of each joint from motion without contact, ``(N,)``.
 
     The largest |r| of blocks of 10 / K_O s follows a Gumbel distribution with the measured mean m
     and standard deviation s. With the Euler constant g and p, the share of blocks with a false

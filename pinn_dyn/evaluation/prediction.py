@@ -189,7 +189,9 @@ def samples_of_window(window: float | None, step: float | None, t: Tensor) -> tu
         return stride, stride * max((len(t) - 1) // stride, 1)
     samples = samples_of("window", window, t)
     if samples % stride:
-        raise ValueError(f"window is {window} s and step is {step} s: expected a multiple of it")
+        raise ValueError(
+            f"window is {window} s and step is {step} s: window must be a multiple of step"
+        )
     return stride, samples
 
 

@@ -138,7 +138,7 @@ def adapted_constants(
 
 
 def _noise(rows: np.ndarray, y: np.ndarray) -> float:
-    """Return the standard deviation of what constants that change linearly leave of y.
+    """Return the standard deviation of the residual of y for linearly changing constants.
 
     It is enlarged for errors of neighbors with the correlation r, by (1 + r) / (1 - r).
     """

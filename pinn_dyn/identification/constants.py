@@ -164,7 +164,7 @@ def contradicted(model: LearnedConstants, fit: Fit) -> list[str]:
 
 
 def far_masses(table: pd.DataFrame) -> list[str]:
-    """Describe masses whose 95 % interval is beyond a factor of 3 of the start of the fit.
+    """Describe masses whose 95 % interval lies more than a factor of 3 from the start of the fit.
 
     Args:
         table: constants of a first fit, which starts from the masses of the URDF.
@@ -185,7 +185,7 @@ def far_masses(table: pd.DataFrame) -> list[str]:
 
 
 def common_factor(model: KnownMechanics, fit: Fit) -> float:
-    """Return the factor by which the 95 % interval of all drive gains together extends."""
+    """Return the ratio of the upper end of the 95 % interval of all drive gains to their value."""
     assert isinstance(model.gain, PositiveConstants)
     index = [model.parameter_names().index(name) for name in model.gain.names]
     deviation = model.gain.spread * float(fit.covariance[index][:, index].mean()) ** 0.5

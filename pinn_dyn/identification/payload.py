@@ -160,7 +160,7 @@ def _doubt(
     cutoff: float,
     samples: int,
 ) -> str:
-    """Return what contradicts a load of at most a mass in kg, "" if nothing does."""
+    """Return the contradiction to a load of at most ``heaviest`` kg, or "" without one."""
     robot = _LoadedRobot(double_copy(model))
     before, after = (_unexplained(robot, x, cutoff, samples) for x in (without, loaded))
     ratios = (after / before).nan_to_num(0.0)  # a passive joint has no torque
@@ -181,7 +181,7 @@ def _doubt(
 def _unexplained(
     robot: _LoadedRobot, runs: Sequence[Trajectory], cutoff: float, samples: int
 ) -> Tensor:
-    """Return the share of each torque that the model and the best load leave, ``(N,)``."""
+    """Return the unexplained share of each torque with the best load, ``(N,)``."""
     motion = filtered_motion([_marked(run, 1.0) for run in runs], cutoff, samples)
     at = robot.samples(*motion)
     moves = motion.v.abs() > REST * motion.v.std(0)

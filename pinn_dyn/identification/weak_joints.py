@@ -19,7 +19,7 @@ _DIFFERENCE = 6**0.5  # standard deviation of the second difference of white noi
 def weak_joints(
     model: LearnedConstants, runs: Sequence[Trajectory], cutoff: float, labels: Sequence[str]
 ) -> list[str]:
-    """Describe joints that a smaller force accelerates than the fit leaves unexplained.
+    """Describe joints whose accelerating force is smaller than the unexplained force of the fit.
 
     The cause is noise of the torques if it makes up more than half of the power of the unexplained
     force in the band of the filter, or else motion that is too slow.

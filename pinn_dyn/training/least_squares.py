@@ -488,7 +488,10 @@ def _speeds(v: Tensor) -> Tensor:
 
 
 def _informative_blocks(steps: int) -> int:
-    """Return 1 for one-step windows, in which dq/dt = v makes the residual of q zero, or else 2."""
+    """Return the number of informative residual blocks: 1 for one-step windows, otherwise 2.
+
+    In one step, dq/dt = v makes the residual of q zero.
+    """
     return 1 if steps == 1 else 2
 
 

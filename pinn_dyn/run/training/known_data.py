@@ -78,9 +78,10 @@ def _with_angles(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str
 
 
 def turning(source: DataSource) -> list[int]:
-    """Return the coordinates of a log in rad that pass the same direction twice.
+    """Return the coordinates of a log in rad that turn by more than one revolution.
 
-    A network of the number of turns would have to learn the same mechanics for each of them.
+    A network that sees the unwrapped angle would have to learn the same mechanics for each
+    revolution.
     """
     if not isinstance(source, LogSource):
         return []
@@ -235,7 +236,7 @@ def joints_of(columns: Sequence[str], joints: Sequence[str]) -> list[str] | None
     """Return the joint of each column, or None unless the columns name different joints.
 
     A column contains the name of its joint. Otherwise the names of joints may end as the columns do
-    or with their numbers, all behind the same prefix: panda_joint1 and q1.
+    or with their numbers, all after the same prefix: panda_joint1 and q1.
     """
     names = [joints[k] for column in columns if (k := _joint_of(column, joints)) is not None]
     if len(set(names)) == len(columns):
