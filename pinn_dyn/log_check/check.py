@@ -29,6 +29,7 @@ from pinn_dyn.log_check.averages import (
     white_noise,
     with_products,
 )
+from pinn_dyn.log_check.chain import chain_regressor, check_order
 from pinn_dyn.log_check.delay import INTERVAL, DelayCurve, clear_delays, input_delays
 from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import residuals
@@ -40,12 +41,10 @@ from pinn_dyn.log_check.runs import (
     Motion,
     check_rests,
     check_runs,
-    check_signs,
-    driven_joint,
     equations_of_motion,
 )
 from pinn_dyn.log_check.stored import store, stored
-from pinn_dyn.log_check.structure import FIT, SCALE, compare_structure, regressor
+from pinn_dyn.log_check.structure import FIT, compare_structure, held_out, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure
 
@@ -216,6 +215,9 @@ def _answers(
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else clear_delays(curves, step)
     late = [widths[k].delayed(clear) for k in chosen]
+    order = None if servo else check_order(late, source.u, source.q.units)
+    if order is not None and inputs == size:
+        late = [order.corrected(x) for x in late]
     data = [x.rows(x.stretch < len(first)) for x in late]
     of_robot = [] if structure is None else compare_structure(structure, data, source.u)
     wrong = {x.place for x in of_robot if x.name == FIT and x.verdict != "ok"}
@@ -223,16 +225,23 @@ def _answers(
         pairs = zip(curves, structure.joint_names, strict=True)
         curves = [x.without(_WRONG) if j in wrong and x.of_bodies else x for x, j in pairs]
         clear = [0.0] * inputs if servo else clear_delays(curves, step)
-        late = [widths[k].delayed(clear) for k in chosen]
     width = max(data.width for data in late)
-    motions = [equations_of_motion(data, source.q, source.u, width, rigid) for data in late]
-    # A fault of an input or of the clock explains runs that differ, and signs.
+    bodies = rigid if not wrong else None
+    if bodies is None and order is not None and inputs == size:
+        generic = np.mean([_left(late[0], i) for i in range(inputs)])
+        bodies = chain_regressor(source.q.units) if order.left < generic else None
+    narrow, wide = (equations_of_motion(x, source.q, source.u, width, bodies) for x in late)
+    # A fault of an input or of the clock explains runs that differ.
     clocks = [x for x in source.measurements if x.name == LOST]
+    of_inputs = [] if order is None else order.measurements
     bad = {x.name for x in [*faults, *clocks] if x.verdict != "ok"}
     of_parts: list[Measurement] = []
     parts: list[Interval] = []
     if bad <= {SATURATED}:
-        of_parts, parts = _odd_parts(motions, names, inverse=inputs <= size, exact=not wrong)
+        of_parts, parts = check_rests(narrow, wide, names)
+        if not parts:
+            of_runs, parts = check_runs(narrow, wide, names, exact=bodies is not None and not wrong)
+            of_parts += of_runs
     if parts and not odd:
         again = _answers(source, training, others, step, longest, structure, servo, parts)
         saturated = any(x.name == SATURATED and x.verdict != "ok" for x in again.measurements)
@@ -240,25 +249,20 @@ def _answers(
             asked = {x.name for x in of_parts}
             kept = [x for x in again.measurements if x.name not in asked]
             return replace(again, measurements=of_parts + kept)
-    results = [] if bad else of_parts
-    negative = any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok")
-    if not bad and not negative:
-        results += check_signs(motions[0], source.u, curves, rigid)
+    results = [] if bad else [*of_parts, *of_inputs]
     results += faults + _coordinates_measured(source, everything, late[0], structure, step)
     results += _inputs_measured(source, data[0], curves, clear) + of_robot
-    driven = [driven_joint(data[0], i) for i in range(inputs)] if 0 < inputs < size else []
-    return _Answers(results, curves, clear, held, motions[0], driven)
+    drawn = narrow
+    if wrong:
+        drawn = equations_of_motion(late[0], source.q, source.u, width, rigid)
+    driven = order.joints if order is not None and inputs < size else []
+    return _Answers(results, curves, clear, held, drawn, driven)
 
 
-def _odd_parts(
-    motions: Sequence[Motion | None], names: Sequence[str], *, inverse: bool, exact: bool
-) -> tuple[list[Measurement], list[Interval]]:
-    """Look for parts of runs in which joints are held, or else for any that do not fit."""
-    results, parts = check_rests(motions, names)
-    if not parts:
-        of_runs, parts = check_runs(motions, names, inverse=inverse, exact=exact)
-        results += of_runs
-    return results, parts
+def _left(data: Averages, i: int) -> float:
+    """Return the share of input i that a generic equation leaves of held-out data."""
+    left, total = held_out(data, i, None)
+    return float(left.mean() / max(total, 1e-300))
 
 
 def _coordinates_measured(

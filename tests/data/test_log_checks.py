@@ -19,7 +19,7 @@ from pinn_dyn.data.logs import (
 from pinn_dyn.data.logs.check.checks import _are_ticks
 from pinn_dyn.data.logs.registers import rows_before_first_sample
 from pinn_dyn.log_check.check import check
-from pinn_dyn.log_check.runs import INERTIA
+from pinn_dyn.log_check.chain import SIGN
 from tests.data.logs_files import motion, source, write
 
 RESAMPLE = {"resample": Resample(rate=100.0, max_gap=0.2)}
@@ -40,7 +40,7 @@ def warned(folder, table, **changes):
 def checked(folder, table):
     """Texts of the check of a log about units of angles and signs of forces."""
     write(folder, table)
-    names = ("largest angle [rad]", INERTIA)
+    names = ("largest angle [rad]", SIGN)
     found = [x for x in check(source(folder)).measurements if x.verdict != "ok"]
     return "\n".join(x.text for x in found if x.name in names)
 
