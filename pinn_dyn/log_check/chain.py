@@ -180,7 +180,7 @@ class Readings:
         return np.flatnonzero(~far)
 
     def direction(self, h: int) -> float:
-        """Return -1 if M(q) is clearly negative, and the inputs give no power; else 1."""
+        """Return the sign of M(q) where it is clear, -1 if the inputs give no power; 0 if mixed."""
         data, n = self.data, self.data.q.shape[1]
         theta = self.theta[: len(self.theta) - OWN * n, h]
         at_rest = self.regressor(data.q, 0 * data.v, 0 * data.a) @ theta
@@ -193,9 +193,12 @@ class Readings:
         noise = 2 * (left * data.moving).std(axis=0)
         smallest = np.maximum(noise, _NOTICEABLE * self.y[:, :, h].std(axis=0))
         clear = (inertia * data.a).std(axis=0) > smallest
-        negative = clear.any() and ((inertia > 0).mean(axis=0)[clear] < _NEGATIVE).all()
+        positive = (inertia > 0).mean(axis=0)[clear]
         power = self.y[:, :, h] * data.v
-        return -1.0 if negative and power.sum() < _POWER * np.abs(power).sum() else 1.0
+        if (positive > _NEGATIVE).all():
+            return 1.0
+        low = power.sum() < _POWER * np.abs(power).sum()
+        return -1.0 if low and (positive < _NEGATIVE).all() else 0.0
 
 
 def _readings(joints: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
@@ -271,15 +274,21 @@ def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) ->
     forces, square = set(u.units) <= {"Nm", "N"}, count == len(units)
     readings, again = (Readings(data, regressor, forces=forces) for data in widths)
     likely = np.union1d(readings.likely(), again.likely())
-    if square and 0 in likely:
-        likely = likely[:1]
-    best = likely[readings.left[:, likely].mean(axis=0).argmin()]
-    left = float(readings.left[:, best].mean())
-    joints = readings.joints[best]
-    signs = np.stack([readings.signs[h] * readings.direction(h) for h in likely])
-    signs = np.where((signs == signs[0]).all(axis=0), signs[0], 1.0)
+    directions = np.array([readings.direction(h) for h in likely])
+    if square and likely[0] == 0 and directions[0] > 0:
+        likely, directions = likely[:1], directions[:1]
+    likely, directions = likely[directions != 0], directions[directions != 0]
+    chosen = joints, signs = readings.joints[0], readings.signs[0]
+    left = float(readings.left[:, 0].mean())
+    if len(likely):
+        best = readings.left[:, likely].mean(axis=0).argmin()
+        joints = readings.joints[likely[best]]
+        all_signs = readings.signs[likely] * directions[:, None]
+        agreed = (all_signs == all_signs[best]).all(axis=0)
+        signs = np.where(agreed, all_signs[best], 1.0)
+        left = float(readings.left[:, likely[best]].mean())
     if square and (left > _EXPLAINS or (readings.joints[likely] != joints).any()):
-        joints, signs = readings.joints[0], readings.signs[0]
+        joints, signs = chosen
     results = []
     for name, joint, sign in zip(u.columns, joints, signs, strict=True):
         text = (

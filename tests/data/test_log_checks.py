@@ -234,11 +234,14 @@ def changed(**columns):
 
 
 def random_force(sign):
-    """A force that the position does not explain, and the motion that follows from it."""
-    levels = np.random.default_rng(0).normal(size=44)
-    force = np.interp(T, np.arange(0, 11, 0.25), levels)
-    v = np.cumsum(force) * 0.01
-    return changed(v1=v, q1=np.cumsum(v) * 0.01, u1=sign * force)
+    """Two masses, and forces that their positions do not explain; the first has a sign."""
+    columns = {}
+    for k, factor in ((1, sign), (2, 1)):
+        levels = np.random.default_rng(k).normal(size=44)
+        force = np.interp(T, np.arange(0, 11, 0.25), levels)
+        v = np.cumsum(force) * 0.01
+        columns |= {f"v{k}": v, f"q{k}": np.cumsum(v) * 0.01, f"u{k}": factor * force}
+    return changed(**columns)
 
 
 def resting():
