@@ -22,6 +22,8 @@ SIGN = "sign of the input"
 """Name of the measurement that judges the sign of an input."""
 EXCHANGED = "residual of the inputs as logged over that with two of them exchanged"
 """Name of the measurement that judges the order of the inputs."""
+FRICTION = "power of the friction over that of the forces"
+"""Name of the measurement that judges the direction of the time."""
 OWN = 6
 """Columns of each joint of its own: offset, spring, damping, and three of dry friction."""
 _LARGEST = 4  # chain of unknown bodies
@@ -30,6 +32,7 @@ _RIDGE = 1e-9
 _WORSE, _TENTHS = 4.0, 0.8  # residual of a reading over that of another; tenths with more
 _EXPLAINS = 0.5  # largest residual of a reading that counts
 _NEGATIVE, _POWER = 0.1, 0.2  # shares of positive inertia and of power of reversed inputs
+_FORWARDS = 0.01  # power of friction over that of the forces, against the motion
 _NOTICEABLE = 0.05  # share of a force from which its inertial part is judged
 _UNITS = {"Nm", "N", "A"}  # of inputs that push their joint forward
 
@@ -200,6 +203,16 @@ class Readings:
         low = power.sum() < _POWER * np.abs(power).sum()
         return -1.0 if low and (positive < _NEGATIVE).all() else 0.0
 
+    def dissipated(self, h: int) -> np.ndarray:
+        """Return the power of the friction of each joint over that of its force, ``(N,)``."""
+        n, v = self.data.q.shape[1], self.data.v
+        x, theta = chain_columns(self.data, self.regressor), self.theta[:, h].copy()
+        own = theta[-OWN * n :].reshape(n, OWN)
+        own[:, :2] = 0.0  # offset and spring
+        theta[: -OWN * n] = 0.0
+        force = np.abs(self.y[:, :, h] * v).mean(axis=0).clip(min=1e-300)
+        return np.asarray((x @ theta * v).mean(axis=0) / force)
+
 
 def _readings(joints: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the joints and the signs of the inputs of all readings, ``(H, M)`` each."""
@@ -303,4 +316,13 @@ def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) ->
     )
     ratio = readings.left[:, 0].mean() / max(left, 1e-300)
     results.append(judged(EXCHANGED, "inputs", ratio, f"below {_WORSE:g}", bool(exchanged), text))
+    lost = np.max(
+        [x.dissipated(likely[0] if len(likely) else 0) for x in (readings, again)], axis=0
+    )
+    text = (
+        "the friction of all joints pushes forwards: does the time of the log run backwards, or is "
+        "more than the friction compensated in the inputs?"
+    )
+    expected, bad = "above 0", left < _EXPLAINS and bool((lost < -_FORWARDS).all())
+    results.append(judged(FRICTION, "all joints", lost.max(), expected, bad, text))
     return Order(results, joints.tolist(), signs, left)

@@ -30,7 +30,13 @@ from pinn_dyn.log_check.averages import (
     with_products,
 )
 from pinn_dyn.log_check.chain import chain_regressor, check_order
-from pinn_dyn.log_check.delay import INTERVAL, DelayCurve, clear_delays, input_delays
+from pinn_dyn.log_check.delay import (
+    INTERVAL,
+    DelayCurve,
+    are_held,
+    clear_delays,
+    input_delays,
+)
 from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import residuals
 from pinn_dyn.log_check.input_faults import SATURATED, input_faults
@@ -175,6 +181,7 @@ def check(
         delays=answers.curves,
         steps=steps,
         delay=_delay(source, answers.clear),
+        hold=source.interpolation == "linear" and not servo and are_held(answers.curves, step),
         candidates=_candidates(source, structure, servo=servo, dry=dry, fast=bool(fast)),
         driven=answers.driven,
         rigid=excitation,

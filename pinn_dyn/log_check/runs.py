@@ -35,7 +35,7 @@ _ITERATIONS = 7  # of reweighted least squares
 _RATIO = 4.0  # residual of an odd window over the usual one
 _FLOOR = 0.005  # usual residual of a window as a share of its signal, at least
 _FRICTION = 0.05  # the same as a share of the dry friction, whose terms are not exact
-_OF_WIDTH = 4.0  # residual with a wide kernel over that with a narrow one, of a fault of the log
+_OF_WIDTH = 2.0  # residual with a wide kernel over that with a narrow one, of a fault of the log
 _REST = 0.1  # shortest rest, s
 _ODD = 0.4  # share of odd windows up to which the others tell the right equation
 _AGREE, _AGREES = 0.4, 0.1  # share of windows that have to agree on an equation; their weight
@@ -367,9 +367,11 @@ def check_runs(
     residual, rows = narrow.residual(), narrow.window
     odd = residual > _RATIO * usual
     if odd.any():
-        smooth, in_wide = np.zeros(odd.shape), np.isin(narrow.numbers, wide.numbers)
-        smooth[in_wide] = wide.residual()[np.isin(wide.numbers, narrow.numbers)]
-        odd &= smooth < _OF_WIDTH * residual
+        both = np.isin(narrow.numbers, wide.numbers)
+        smooth = wide.residual()[np.isin(wide.numbers, narrow.numbers)]
+        growth = (smooth + 1e-12) / (residual[both] + 1e-12)
+        growth = growth if wide.data.width > narrow.data.width else 1 / growth
+        odd[both] &= growth < _OF_WIDTH
         odd &= _in_a_row(odd)
     runs = narrow.data.run[np.unique(rows, return_index=True)[1]]  # of each window
     share = odd.any(axis=1).mean()
