@@ -203,6 +203,12 @@ class Readings:
         low = power.sum() < _POWER * np.abs(power).sum()
         return -1.0 if low and (positive < _NEGATIVE).all() else 0.0
 
+    def unexplained(self, h: int) -> np.ndarray:
+        """Return the share of each left side that a reading leaves, ``(N,)``."""
+        left = self.y[:, :, h] - chain_columns(self.data, self.regressor) @ self.theta[:, h]
+        squares = (left**2 * self.data.moving).sum(axis=0)
+        return squares / (self.y[:, :, h] ** 2 * self.data.moving).sum(axis=0).clip(min=1e-300)
+
     def dissipated(self, h: int) -> np.ndarray:
         """Return the power of the friction of each joint over that of its force, ``(N,)``."""
         n, v = self.data.q.shape[1], self.data.v
@@ -251,13 +257,13 @@ class Order(NamedTuple):
         measurements: measurements.
         joints: joint that each input drives.
         signs: factor 1 or -1 of each input.
-        left: share of held-out data that the equation of the chain leaves.
+        explained: share of each input that the equation of the chain leaves, ``(M,)``.
     """
 
     measurements: list[Measurement]
     joints: Sequence[int]
     signs: np.ndarray
-    left: float
+    explained: np.ndarray
 
     def corrected(self, data: Averages) -> Averages:
         """Return averages with the inputs of the joints in turn, and their signs."""
@@ -316,13 +322,12 @@ def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) ->
     )
     ratio = readings.left[:, 0].mean() / max(left, 1e-300)
     results.append(judged(EXCHANGED, "inputs", ratio, f"below {_WORSE:g}", bool(exchanged), text))
-    lost = np.max(
-        [x.dissipated(likely[0] if len(likely) else 0) for x in (readings, again)], axis=0
-    )
+    h, way = (likely[best], directions[best]) if len(likely) else (0, 1.0)
+    lost = np.max([way * x.dissipated(h) for x in (readings, again)], axis=0)
     text = (
         "the friction of all joints pushes forwards: does the time of the log run backwards, or is "
         "more than the friction compensated in the inputs?"
     )
     expected, bad = "above 0", left < _EXPLAINS and bool((lost < -_FORWARDS).all())
     results.append(judged(FRICTION, "all joints", lost.max(), expected, bad, text))
-    return Order(results, joints.tolist(), signs, left)
+    return Order(results, joints.tolist(), signs, readings.unexplained(h)[joints])

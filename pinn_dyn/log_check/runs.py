@@ -223,12 +223,14 @@ class Motion:
         equations: one of all joints, or one of each input, or of v or a.
         numbers: numbers of the windows, ``(B,)``, by time: kernels of other widths have the same.
         of_forces: the left sides are forces.
+        exact: the equation is one of all joints of a robot.
     """
 
     data: Averages
     equations: Sequence[Equation]
     numbers: np.ndarray
     of_forces: bool = True
+    exact: bool = True
 
     @property
     def labels(self) -> list[str]:
@@ -316,7 +318,8 @@ def equations_of_motion(
     rows, sides, count = equations[0].x.shape
     if rows * sides < _PER_TERM * count:
         return None
-    return Motion(data, equations, numbers, 0 < size <= n)
+    exact = bodies is not None and size == n
+    return Motion(data, equations, numbers, 0 < size <= n, exact)
 
 
 def _equation(
@@ -387,7 +390,7 @@ def check_runs(
         all_odd = odd[rows, j] & (narrow.data.run == k)
         cause = _cause(narrow, bad[rows, j], j) or _cause(narrow, all_odd, j)
         times = narrow.data.t[bad[rows, j]]
-        if not cause and (bad.any(axis=1).sum() < _UNKNOWN_WINDOWS or not exact):
+        if not cause and (bad.any(axis=1).sum() < _UNKNOWN_WINDOWS or not (exact and narrow.exact)):
             continue
         text = (
             f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
