@@ -229,7 +229,7 @@ def _answers(
         asked.clear = [0.0] * inputs if servo else clear_delays(asked.curves, step)
     narrow, wide = _motions(source, late, rigid, exact=rigid is not None and not wrong)
     # A fault of an input or of the clock explains runs that differ.
-    clocks = [x for x in source.measurements if x.name == LOST]
+    clocks = [x for x in source.measurements if x.name in (LOST, STATE)]
     bad = {x.name for x in [*asked.faults, *clocks] if x.verdict != "ok"}
     of_parts: list[Measurement] = []
     parts: list[Interval] = []
@@ -300,17 +300,19 @@ def _motions(
     """Return the equations with kernels of two widths.
 
     They are those of rigid bodies, or of a chain of unknown bodies. If these leave a part, those of
-    single joints are used if they leave less.
+    single joints are used if they leave half of that: they have many more constants.
     """
     width, chain = max(x.width for x in widths), chain_regressor(source.q.units)
-    results: list[tuple[float, list[Motion | None]]] = []
+    results: list[Motion | None] = []
+    least = np.inf
     for bodies in (rigid if exact else chain, None):
         motions = [equations_of_motion(x, source.q, source.u, width, bodies) for x in widths]
         left = np.inf if motions[0] is None else float(np.median(motions[0].usual()))
-        results.append((left, motions))
+        if not results or left < least / 2:
+            results, least = motions, left
         if left < _FITS:
             break
-    return min(results, key=lambda x: x[0])[1]
+    return results
 
 
 def _coordinates_measured(

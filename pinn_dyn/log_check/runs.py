@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from pinn_dyn.data.logs import Columns, Measurement
 from pinn_dyn.data.logs.errors import listed
@@ -41,7 +42,7 @@ _ODD = 0.4  # share of odd windows up to which the others tell the right equatio
 _AGREE, _AGREES = 0.4, 0.1  # share of windows that have to agree on an equation; their weight
 _WORSE = 2.0  # residual of an equation over that of another, of a wrong equation
 _UNKNOWN = "is it another payload or unit, or are columns exchanged, reversed or stuck?"
-_UNKNOWN_WINDOWS = 4  # odd windows of a run from which an unknown cause is named
+_UNKNOWN_WINDOWS = 4  # odd windows in a row from which an unknown cause is named
 _CLEAR = 0.9  # correlation from which a scale is clear
 _SCALES = (0.2, 5.0)  # of another load; beyond, another unit
 
@@ -390,7 +391,9 @@ def check_runs(
         all_odd = odd[rows, j] & (narrow.data.run == k)
         cause = _cause(narrow, bad[rows, j], j) or _cause(narrow, all_odd, j)
         times = narrow.data.t[bad[rows, j]]
-        if not cause and (bad.any(axis=1).sum() < _UNKNOWN_WINDOWS or not (exact and narrow.exact)):
+        # A force that depends on the state acts for a short time.
+        in_a_row = scipy.ndimage.binary_opening(bad.any(axis=1), np.ones(_UNKNOWN_WINDOWS))
+        if not cause and not (in_a_row.any() and exact and narrow.exact):
             continue
         text = (
             f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "

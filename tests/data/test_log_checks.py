@@ -336,7 +336,7 @@ def test_the_check_names_degrees_and_a_reversed_force(tmp_path):
     degrees = changed(q2=np.degrees(Q2), v2=np.degrees(V2))
     assert re.match("run, column 'q2': an angle of ", checked(tmp_path, degrees))
     assert checked(tmp_path, random_force(1)) == ""
-    assert "input 'u1' seems to push backwards" in checked(tmp_path, random_force(-1))
+    assert "input 'u1' seems to push joint 1 backwards" in checked(tmp_path, random_force(-1))
 
 
 def test_a_joint_that_turns_many_times_is_not_in_degrees(tmp_path):
