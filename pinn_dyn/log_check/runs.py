@@ -391,9 +391,7 @@ def check_runs(
         all_odd = odd[rows, j] & (narrow.data.run == k)
         cause = _cause(narrow, bad[rows, j], j) or _cause(narrow, all_odd, j)
         times = narrow.data.t[bad[rows, j]]
-        # A force that depends on the state acts for a short time.
-        in_a_row = scipy.ndimage.binary_opening(bad.any(axis=1), np.ones(_UNKNOWN_WINDOWS))
-        if not cause and not (in_a_row.any() and exact and narrow.exact):
+        if not cause and not (exact and narrow.exact and _certain(narrow, bad, odd)):
             continue
         text = (
             f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
@@ -406,6 +404,18 @@ def check_runs(
         parts.append(Interval(int(k), float(times[0]), float(times[-1])))
     largest, expected = float((residual / usual).max()), f"below {_RATIO:g}"
     return results or [judged(RESIDUAL, "all runs", largest, expected, False, "")], parts
+
+
+def _certain(motion: Motion, bad: np.ndarray, odd: np.ndarray) -> bool:
+    """Tell whether four bad windows are in a row, and most odd rows are at poses of others.
+
+    Else a force that depends on the position may explain them, such as that of a hose.
+    """
+    rows = odd.any(axis=1)[motion.window]
+    low, high = motion.data.q[~rows].min(axis=0), motion.data.q[~rows].max(axis=0)
+    usual = ((motion.data.q[rows] >= low) & (motion.data.q[rows] <= high)).all(axis=1)
+    in_a_row = scipy.ndimage.binary_opening(bad.any(axis=1), np.ones(_UNKNOWN_WINDOWS))
+    return bool(in_a_row.any() and usual.mean() > 0.5)
 
 
 def check_rests(
