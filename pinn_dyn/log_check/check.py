@@ -29,7 +29,14 @@ from pinn_dyn.log_check.averages import (
     white_noise,
     with_products,
 )
-from pinn_dyn.log_check.delay import INTERVAL, DelayCurve, clear_delays, input_delays
+from pinn_dyn.log_check.chain import EXCHANGED, Order, chain_regressor, check_order
+from pinn_dyn.log_check.delay import (
+    INTERVAL,
+    DelayCurve,
+    are_held,
+    clear_delays,
+    input_delays,
+)
 from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import residuals
 from pinn_dyn.log_check.input_faults import SATURATED, input_faults
@@ -40,12 +47,10 @@ from pinn_dyn.log_check.runs import (
     Motion,
     check_rests,
     check_runs,
-    check_signs,
-    driven_joint,
     equations_of_motion,
 )
 from pinn_dyn.log_check.stored import store, stored
-from pinn_dyn.log_check.structure import FIT, SCALE, compare_structure, regressor
+from pinn_dyn.log_check.structure import FIT, compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure
 
@@ -64,6 +69,7 @@ _LIMITS = (
     ("noise / range", _NOISE, "its noise is {:.2g} % of its range"),
     ("test outside", _OUTSIDE, "{:.3g} % of the test is outside the training range"),
 )
+_FITS = 0.1  # usual residual of a window, below which no other equation is tried
 _WRONG = "the robot of the URDF has other forces"  # reason why there is no delay
 _judged = partial(judged, section="docs/bags_and_other_logs.md#is-the-log-good-enough")
 
@@ -176,6 +182,7 @@ def check(
         delays=answers.curves,
         steps=steps,
         delay=_delay(source, answers.clear),
+        hold=source.interpolation == "linear" and not servo and are_held(answers.curves, step),
         candidates=_candidates(source, structure, servo=servo, dry=dry, fast=bool(fast)),
         driven=answers.driven,
         rigid=excitation,
@@ -208,57 +215,104 @@ def _answers(
     curves = input_delays(first, longest=longest, rigid=rigid, widths=of_training)
     if not widths:
         return _Answers([], curves, [0.0] * inputs, [1] * inputs)
-    chosen = compared(widths)
-    faults, curves, held = input_faults([of_training[k] for k in chosen], curves, source.u, rigid)
-    states = {x.place for x in source.measurements if x.name == STATE and x.verdict == "stop"}
-    pairs = zip(curves, source.u.columns, strict=False)
-    curves = [x.without("the input is a state") if name in states else x for x, name in pairs]
-    # The lag of a servo is no delay.
-    clear = [0.0] * inputs if servo else clear_delays(curves, step)
-    late = [widths[k].delayed(clear) for k in chosen]
+    chosen = [widths[k] for k in compared(widths)]
+    asked = _ask_inputs(source, chosen, len(first), curves, rigid, step, servo)
+    late = [x.delayed(asked.clear) for x in chosen]
+    if asked.order is not None and inputs == size:
+        late = [asked.order.corrected(x) for x in late]
     data = [x.rows(x.stretch < len(first)) for x in late]
     of_robot = [] if structure is None else compare_structure(structure, data, source.u)
     wrong = {x.place for x in of_robot if x.name == FIT and x.verdict != "ok"}
     if wrong and structure is not None:  # whose delays are wrong, too
-        pairs = zip(curves, structure.joint_names, strict=True)
-        curves = [x.without(_WRONG) if j in wrong and x.of_bodies else x for x, j in pairs]
-        clear = [0.0] * inputs if servo else clear_delays(curves, step)
-        late = [widths[k].delayed(clear) for k in chosen]
-    width = max(data.width for data in late)
-    motions = [equations_of_motion(data, source.q, source.u, width, rigid) for data in late]
-    # A fault of an input or of the clock explains runs that differ, and signs.
-    clocks = [x for x in source.measurements if x.name == LOST]
-    bad = {x.name for x in [*faults, *clocks] if x.verdict != "ok"}
+        pairs = zip(asked.curves, structure.joint_names, strict=True)
+        asked.curves = [x.without(_WRONG) if j in wrong and x.of_bodies else x for x, j in pairs]
+        asked.clear = [0.0] * inputs if servo else clear_delays(asked.curves, step)
+    narrow, wide = _motions(source, late, rigid, exact=rigid is not None and not wrong)
+    # A fault of an input or of the clock explains runs that differ.
+    clocks = [x for x in source.measurements if x.name in (LOST, STATE)]
+    bad = {x.name for x in [*asked.faults, *clocks] if x.verdict != "ok"}
     of_parts: list[Measurement] = []
     parts: list[Interval] = []
     if bad <= {SATURATED}:
-        of_parts, parts = _odd_parts(motions, names, inverse=inputs <= size, exact=not wrong)
+        of_parts, parts = check_rests(narrow, wide, names)
+        if not parts:
+            of_runs, parts = check_runs(narrow, wide, names, exact=not wrong)
+            of_parts += of_runs
     if parts and not odd:
         again = _answers(source, training, others, step, longest, structure, servo, parts)
         saturated = any(x.name == SATURATED and x.verdict != "ok" for x in again.measurements)
         if not saturated:  # parts that do not fit look like a saturation
-            asked = {x.name for x in of_parts}
-            kept = [x for x in again.measurements if x.name not in asked]
+            kept = [x for x in again.measurements if x.name not in {x.name for x in of_parts}]
             return replace(again, measurements=of_parts + kept)
-    results = [] if bad else of_parts
-    negative = any(x.name == SCALE and x.value < 0 for x in of_robot if x.verdict != "ok")
-    if not bad and not negative:
-        results += check_signs(motions[0], source.u, curves, rigid)
-    results += faults + _coordinates_measured(source, everything, late[0], structure, step)
-    results += _inputs_measured(source, data[0], curves, clear) + of_robot
-    driven = [driven_joint(data[0], i) for i in range(inputs)] if 0 < inputs < size else []
-    return _Answers(results, curves, clear, held, motions[0], driven)
+    order = asked.order
+    results = [] if bad else of_parts + ([] if order is None else order.measurements)
+    results += asked.faults + _coordinates_measured(source, everything, late[0], structure, step)
+    results += _inputs_measured(source, data[0], asked.curves, asked.clear) + of_robot
+    drawn = narrow
+    if wrong:
+        drawn = equations_of_motion(late[0], source.q, source.u, late[0].width, rigid)
+    driven = order.joints if order is not None and inputs < size else []
+    return _Answers(results, asked.curves, asked.clear, asked.held, drawn, driven)
 
 
-def _odd_parts(
-    motions: Sequence[Motion | None], names: Sequence[str], *, inverse: bool, exact: bool
-) -> tuple[list[Measurement], list[Interval]]:
-    """Look for parts of runs in which joints are held, or else for any that do not fit."""
-    results, parts = check_rests(motions, names)
-    if not parts:
-        of_runs, parts = check_runs(motions, names, inverse=inverse, exact=exact)
-        results += of_runs
-    return results, parts
+@dataclass
+class _Inputs:
+    """Answers about the inputs: faults, delay curves, clear delays, rows of a hold, and order."""
+
+    faults: list[Measurement]
+    curves: list[DelayCurve]
+    clear: list[float]
+    held: list[int]
+    order: Order | None
+
+
+def _ask_inputs(
+    source: logs.LogSource,
+    widths: Sequence[Averages],
+    training: int,
+    curves: list[DelayCurve],
+    rigid: Regressor | None,
+    step: float,
+    servo: bool,
+) -> _Inputs:
+    """Ask for the order of the inputs, for their faults, and for their delays beside them."""
+    # The lag of a servo is no delay.
+    clear = [0.0] * len(curves) if servo else clear_delays(curves, step)
+    order = None
+    if not servo:
+        order = check_order([x.delayed(clear) for x in widths], source.u, source.q.units)
+    of_training = [x.rows(x.stretch < training) for x in widths]
+    explained = None if order is None else order.explained
+    faults, curves, held = input_faults(of_training, curves, source.u, rigid, explained)
+    states = {x.place for x in source.measurements if x.name == STATE and x.verdict == "stop"}
+    pairs = zip(curves, source.u.columns, strict=False)
+    curves = [x.without("the input is a state") if name in states else x for x, name in pairs]
+    bad = {x.name for x in order.measurements if x.verdict != "ok"} if order else set()
+    if EXCHANGED in bad:
+        curves = [x.without("the inputs are exchanged") for x in curves]
+    clear = [0.0] * len(curves) if servo else clear_delays(curves, step)
+    return _Inputs(faults, curves, clear, held, order)
+
+
+def _motions(
+    source: logs.LogSource, widths: Sequence[Averages], rigid: Regressor | None, *, exact: bool
+) -> list[Motion | None]:
+    """Return the equations with kernels of two widths.
+
+    They are those of rigid bodies, or of a chain of unknown bodies. If these leave a part, those of
+    single joints are used if they leave half of that: they have many more constants.
+    """
+    width, chain = max(x.width for x in widths), chain_regressor(source.q.units)
+    results: list[Motion | None] = []
+    least = np.inf
+    for bodies in (rigid if exact else chain, None):
+        motions = [equations_of_motion(x, source.q, source.u, width, bodies) for x in widths]
+        left = np.inf if motions[0] is None else float(np.median(motions[0].usual()))
+        if not results or left < least / 2:
+            results, least = motions, left
+        if left < _FITS:
+            break
+    return results
 
 
 def _coordinates_measured(

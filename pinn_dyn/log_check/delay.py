@@ -166,6 +166,13 @@ def clear_delays(curves: Sequence[DelayCurve], step: float) -> list[float]:
     return np.where(clear, values, 0.0).tolist()
 
 
+def are_held(curves: Sequence[DelayCurve], step: float) -> bool:
+    """Tell whether the inputs clearly act half a sample late, as values held between samples."""
+    delays = np.array([x.delay for x in curves if x.delay is not None])
+    widths = INTERVAL * np.array([x.spread for x in curves if x.delay is not None])
+    return len(delays) > 0 and bool((np.abs(delays - step / 2) + widths < step / 4).all())
+
+
 def _better(generic: DelayCurve, rigid: DelayCurve, step: float) -> DelayCurve:
     """Return the curve of rigid bodies if it has a delay, with the generic one if they differ."""
     best, other = (rigid, generic) if not rigid.reason else (generic, rigid)

@@ -25,10 +25,10 @@ def forces(motion: Motion) -> Figure:
     rows = np.flatnonzero(data.run == np.bincount(data.run).argmax())[:_DRAWN]
     t = data.t[rows]
     breaks = np.flatnonzero(np.diff(t) > 10 * np.median(np.diff(t))) + 1  # between stretches
-    pairs = [equation.predicted() for equation in motion.equations]
-    measured, explained = (np.hstack(x)[rows] for x in zip(*pairs, strict=True))
-    labels = [label for equation in motion.equations for label in equation.labels]
-    figure, (axes,) = panels([labels], t, title="Forces and the equation of motion, means removed")
+    measured, explained = motion.measured()[rows], motion.predicted()[rows]
+    figure, (axes,) = panels(
+        [motion.labels], t, title="Forces and the equation of motion, means removed"
+    )
     curves = {
         "measured": (measured, TRUTH),
         "explained": (explained, COLORS[0]),
@@ -53,7 +53,7 @@ def residuals(motion: Motion, q: Columns, v: Columns | None, u: Columns) -> Figu
     from matplotlib.figure import Figure  # takes a quarter of a second
 
     count = len(q.columns)
-    if len(motion.equations) != count or not motion.data.u.shape[1]:
+    if motion.equations[0].joints is None:
         return None
     figure = Figure(figsize=(9.0, 1.7 * count + 0.8), layout="constrained")
     grid = figure.subplots(count, 2, squeeze=False, sharey="row")
@@ -62,17 +62,18 @@ def residuals(motion: Motion, q: Columns, v: Columns | None, u: Columns) -> Figu
     units = {"q": q.unit, "v": [f"{x}/s" for x in q.unit]}
     if v is not None:
         states["v"], names["v"], units["v"] = v.from_si(motion.data.v), v.columns, v.unit
-    for k, equation in enumerate(motion.drawn):
-        measured, explained = equation.predicted()
-        left, moving = (measured - explained)[:, 0], motion.data.moving[:, k]
-        forces = {"q": left, "v": left + equation.dry_friction()}
+    left = motion.measured() - motion.predicted()
+    friction = np.hstack([x.dry_friction() for x in motion.equations])
+    for k, label in enumerate(motion.labels):
+        moving = motion.data.moving[:, k]
+        forces = {"q": left[:, k], "v": left[:, k] + friction[:, k]}
         for ax, key in zip(grid[k], states, strict=True):
             x, y = states[key][moving, k], forces[key][moving]
             ax.plot(x, y, ".", color=COLORS[1], markersize=1.5, alpha=0.3)
             ax.plot(*_means(x, y), color=COLORS[0], linewidth=1.5)
             ax.axhline(0, color="gray", linewidth=0.6)
             ax.set_xlabel(f"{names[key][k]} [{units[key][k]}]")
-        grid[k, 0].set_ylabel(f"{equation.labels[0]}: residual [{u.units[k]}]")
+        grid[k, 0].set_ylabel(f"{label}: residual [{u.units[k]}]")
     title = "Residual of each force; on the right with its dry friction; lines are means"
     figure.suptitle(title, fontsize="medium")
     return figure

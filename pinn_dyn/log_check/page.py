@@ -66,6 +66,7 @@ class LogCheck:
         delays: delay curve of each input.
         steps: entries for ``steps`` of the data set in YAML: a filter, if needed.
         delay: ``delay`` of the data set, s, if the measured one calls for a change; None otherwise.
+        hold: the inputs are held between samples, where the data set draws lines.
         candidates: models of a training, each with the reason and its options.
         driven: number of the joint that each input drives, of fewer inputs than coordinates.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
@@ -81,6 +82,7 @@ class LogCheck:
     steps: list[str]
     delay: float | list[float] | None
     candidates: list[tuple[str, list[str]]]
+    hold: bool = False
     driven: Sequence[int] = ()
     rigid: RigidExcitation | None = None
     motion: Motion | None = None
@@ -107,6 +109,10 @@ class LogCheck:
         if self.steps and not self.source.steps:
             lines = [wording.steps(self.steps)]
         lines += [] if self.delay is None else [wording.line("delay", self.delay, "s")]
+        if self.hold:
+            value = "hold" if wording.IN_YAML.get() else repr("hold")
+            reason = "the inputs act half a sample late"
+            lines.append(wording.line("interpolation", value, reason))
         return "\n".join(lines)
 
     def table(self) -> pd.DataFrame:

@@ -1,56 +1,50 @@
 """Comparison of the runs of a log, in windows of half a second, by their common equation of motion.
 
-With at most as many inputs as coordinates, inverse dynamics u_i = f_i(q, v, a). With more inputs,
-increments v = f(q) + B u, or the acceleration a = f(q, v) + B u if it leaves less unexplained.
-Without inputs, a = f(q, v).
+With an input per joint, inverse dynamics of all joints with one set of constants: of rigid bodies,
+or of a chain of unknown bodies where it leaves less than equations of single joints
+u_i = f_i(q, v, a). With more inputs, increments v = f(q) + B u, or the acceleration
+a = f(q, v) + B u if it leaves less. Without inputs, a = f(q, v).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from pinn_dyn.data.logs import Columns, Measurement
 from pinn_dyn.data.logs.errors import listed
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import CUT, Averages
-from pinn_dyn.log_check.delay import FEWEST, DelayCurve
-from pinn_dyn.log_check.equation import (
-    EquationOfMotionRegression,
-    Regressor,
-    bodies,
-    force_columns,
-    terms,
-)
+from pinn_dyn.log_check.chain import OWN, chain_columns, solve
+from pinn_dyn.log_check.delay import FEWEST
+from pinn_dyn.log_check.equation import Regressor, force_columns, terms
 
 RESIDUAL = "residual over that of the median window"
 """Name of the measurement that compares the windows of runs."""
 HELD = "time in which the joints are held [s]"
 """Name of the measurement of brakes and contacts."""
-INERTIA = "share of positive effective inertia"
-"""Name of the measurement that judges the sign of an input."""
 _WINDOW = 0.5  # s
 _WIDTHS, _MOST = 10, 200  # widths in a window, and windows of a log
 _FEWEST = 8  # rows of a window
 _PER_TERM = 6  # rows at least
-_RESIDUAL, _RATIO = 0.3, 3.0  # of an odd window: share of the signal, and of the usual residual
-_FAR = 6.0  # residual over the usual one of an odd window among odd neighbors
+_ITERATIONS = 7  # of reweighted least squares
+_RATIO = 4.0  # residual of an odd window over the usual one
+_FLOOR = 0.005  # usual residual of a window as a share of its signal, at least
+_FRICTION = 0.05  # the same as a share of the dry friction, whose terms are not exact
 _OF_WIDTH = 2.0  # residual with a wide kernel over that with a narrow one, of a fault of the log
 _REST = 0.1  # shortest rest, s
 _ODD = 0.4  # share of odd windows up to which the others tell the right equation
 _AGREE, _AGREES = 0.4, 0.1  # share of windows that have to agree on an equation; their weight
 _WORSE = 2.0  # residual of an equation over that of another, of a wrong equation
-_ACTS = 0.5  # residual without an input over that with it
 _UNKNOWN = "is it another payload or unit, or are columns exchanged, reversed or stuck?"
-_UNKNOWN_WINDOWS = 4  # odd windows of a run from which an unknown cause is named
+_UNKNOWN_WINDOWS = 4  # odd windows in a row from which an unknown cause is named
 _CLEAR = 0.9  # correlation from which a scale is clear
 _SCALES = (0.2, 5.0)  # of another load; beyond, another unit
-_NOTICEABLE = 0.05  # share of a force from which its inertial part is judged
-_SIGN_ROWS = 600  # from which the sign of an input is judged
-_FORCES = {"Nm", "N", "A"}  # units of inputs that push their joint forward
 
 
 class Interval(NamedTuple):
@@ -73,90 +67,152 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class Equation:
-    """An equation of motion y = X theta of all runs.
+    """An equation of motion y = X theta of all runs, fitted to the windows that agree.
 
     Attributes:
-        columns: columns of y and X by name, ``(R, .)``.
-        x: names of the columns of X.
-        labels: names of the K columns of y.
+        data: averages.
+        x, y: columns ``(R, K, P)`` and left sides ``(R, K)``, without their medians ``offset``.
+        labels: names of the left sides.
         window: number of the window of each row, ``(R,)``.
-        theta: coefficients, ``(P, K)``.
-        weights: weights of the windows, ``(1, B)``, small where they disagree with the others.
-        agree: windows that do not, ``(B,)``.
-        offset: constant that was subtracted from the forces, ``(K,)``.
-        row_weights: weights of the rows, ``(R, 1)``, small at jumps of q.
-        of_bodies: X are the terms of rigid bodies.
-        resting: rows in which the joint of the input rests, ``(R,)``; None without a joint.
-        friction: columns of X that are its dry friction.
+        joints: joint of each left side, whose dry friction may hold it at rest; None without.
+        friction: columns of dry friction of each left side, ``(K, F)``.
+        damping: column of viscous friction of each left side, ``(K,)``.
     """
 
-    columns: dict[str, np.ndarray]
-    x: list[str]
+    data: Averages
+    x: np.ndarray
+    y: np.ndarray
     labels: Sequence[str]
     window: np.ndarray
-    theta: np.ndarray
-    weights: np.ndarray
-    agree: np.ndarray
-    offset: np.ndarray
-    row_weights: np.ndarray
-    of_bodies: bool = False
-    resting: np.ndarray | None = None
-    friction: Sequence[int] = ()
+    joints: Sequence[int] | None = None
+    friction: Sequence[Sequence[int]] = ()
+    damping: Sequence[int] = ()
 
-    def of_windows(self, weights: np.ndarray | None = None) -> np.ndarray:
+    @cached_property
+    def row_weights(self) -> np.ndarray:
+        """Weights of the rows, ``(R, 1)``, small at jumps of q."""
+        return self.data.row_weights()
+
+    @cached_property
+    def resting(self) -> np.ndarray:
+        """Rows in which the joint of a left side rests, ``(R, K)``."""
+        if self.joints is None:
+            return np.zeros(self.y.shape, dtype=bool)
+        moving = self.data.moving[:, list(self.joints)]
+        return ~moving & (moving.sum(axis=0) >= FEWEST)
+
+    @cached_property
+    def size(self) -> np.ndarray:
+        """Root mean square of each left side in the median window, ``(K,)``."""
+        means = self.means(self.y)
+        return np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0)).clip(min=1e-300)
+
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Return the root mean squares of columns in each window, ``(B, .)``."""
+        squares = [np.bincount(self.window, column) for column in (self.row_weights * values**2).T]
+        return np.sqrt(np.transpose(squares) / np.bincount(self.window)[:, None])
+
+    def fitted(self, weights: np.ndarray) -> np.ndarray:
+        """Return theta ``(P,)`` for weights of the windows ``(B,)``."""
+        rows = self.row_weights * np.sqrt(weights)[self.window, None] * ~self.resting / self.size
+        x = (self.x * rows[:, :, None]).reshape(-1, self.x.shape[2])
+        return solve(x, (self.y * rows).ravel())
+
+    def residual(self, theta: np.ndarray) -> np.ndarray:
         """Return the residual of each window as a share of its signal, ``(B, K)``.
 
         The share is that of the median window if that window has a larger signal. At rest dry
         friction may hold any force up to its level, which does not count.
         """
-        theta = self.theta if weights is None else self._fitted(weights)
-        left = np.abs(self.columns["y"] - self._terms() @ theta)
-        if self.resting is not None:
-            at_rest = (left - self.friction_level(theta)).clip(min=0)
-            left = np.where(self.resting[:, None], at_rest, left)
-        means, signal = (self._means(x) for x in (left, self.columns["y"]))
-        usual = np.maximum(np.median(signal, axis=0), 1e-9 * signal.max(axis=0))
-        return means / np.maximum(signal, usual.clip(min=1e-300))
+        left = np.abs(self.y - self.x @ theta)
+        at_rest = (left - self.friction_level(theta)).clip(min=0)
+        left = np.where(self.resting, at_rest, left)
+        return self.means(left) / np.maximum(self.means(self.y), self.size)
+
+    def friction_level(self, theta: np.ndarray) -> np.ndarray:
+        """Return the largest dry friction of each joint, ``(K,)``."""
+        levels = np.zeros(self.y.shape[1])
+        for k, columns in enumerate(self.friction):
+            levels[k] = np.abs(self.x[:, k, columns]).max(axis=0) @ np.abs(theta[columns])
+        return levels
+
+    def dry_friction(self) -> np.ndarray:
+        """Return the part of X theta that is dry friction of the own joint, ``(R, K)``."""
+        result = np.zeros(self.y.shape)
+        for k, columns in enumerate(self.friction):
+            result[:, k] = self.x[:, k, columns] @ self.theta[columns]
+        return result
+
+    def dissipation(self) -> np.ndarray:
+        """Return the part of X theta that is dry and viscous friction, ``(R, K)``."""
+        result = self.dry_friction()
+        for k, column in enumerate(self.damping):
+            result[:, k] += self.x[:, k, column] * self.theta[column]
+        return result
+
+    @cached_property
+    def base(self) -> np.ndarray:
+        """Weights of the windows ``(B,)``, small where a larger unit would outweigh all others."""
+        values = np.hstack([self.y, self.data.u - np.median(self.data.u, axis=0)])
+        means = self.means(values)
+        usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0)).clip(min=1e-300)
+        return (means / usual).clip(min=1).max(axis=1) ** -2.0
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Weights of the windows ``(B,)``, small where they disagree with most others.
+
+        The fits start from all windows. If many disagree, they start from the earlier and the later
+        half of each run, too: a payload that is picked up in the middle changes half of them.
+        """
+        rows = np.bincount(self.data.run).clip(min=1)
+        late_rows = (
+            self.data.passed > (np.bincount(self.data.run, self.data.passed) / rows)[self.data.run]
+        )
+        late = np.bincount(self.window, late_rows) > np.bincount(self.window) / 2
+        first = self._robust(np.ones(len(late), dtype=bool))
+        worst = self.residual(self.fitted(first)).max(axis=1)
+        least = float(np.quantile(worst, _AGREE))
+        if (worst > _RATIO * least).mean() < 1 - 2 * _AGREE or late.all() or not late.any():
+            return first
+        others = [self._robust(start) for start in (~late, late)]
+        left = [self.residual(self.fitted(x)).max(axis=1) for x in others]
+        agreed = [float(np.quantile(x, _AGREE)) for x in left]
+        k = int(np.argmin(agreed))
+        return others[k] if agreed[k] < least / _WORSE else first
+
+    def _robust(self, start: np.ndarray) -> np.ndarray:
+        """Return weights by the loss of Geman and McClure (1985), from a mask of windows."""
+        weights = start.astype(float)
+        for cut in 0.5 ** np.arange(1, _ITERATIONS + 1):
+            residual = self.residual(self.fitted(weights * self.base))
+            usual = np.median(residual[start], axis=0).clip(min=1e-3)
+            worst = (residual / usual).max(axis=1)
+            weights = 1 / (1 + (worst / max(2.5, cut * worst.max())) ** 2) ** 2
+        return weights * self.base
+
+    @cached_property
+    def theta(self) -> np.ndarray:
+        """Coefficients, ``(P,)``."""
+        return self.fitted(self.weights)
 
     def usual(self) -> np.ndarray:
         """Return the residual of the median window that agrees with the equation, ``(K,)``.
 
         The joint moves in these windows most of the time, if there are such windows.
         """
-        agree = self.agree
-        if self.resting is not None:
-            moving = np.bincount(self.window, ~self.resting) > np.bincount(self.window) / 2
-            agree = moving & agree if (moving & agree).any() else agree
-        return np.median(self.of_windows()[agree], axis=0)
+        agree = self.weights > _AGREES * self.base
+        values = np.where(agree[:, None], self.residual(self.theta), np.nan)
+        counts = np.bincount(self.window)
+        moving = [np.bincount(self.window, ~x) > counts / 2 for x in self.resting.T]
+        in_motion = np.where(np.transpose(moving), values, np.nan)
+        chosen = np.where(np.isfinite(in_motion).any(axis=0), in_motion, values)
+        least = _FRICTION * self.friction_level(self.theta) / self.size
+        return np.maximum(np.nanmedian(chosen, axis=0), least.clip(min=_FLOOR))
 
-    def _means(self, x: np.ndarray) -> np.ndarray:
-        """Return the root mean squares of columns in each window, ``(B, K)``."""
-        squares = [np.bincount(self.window, column) for column in (self.row_weights * x**2).T]
-        return np.sqrt(np.transpose(squares) / np.bincount(self.window)[:, None])
-
-    def friction_level(self, theta: np.ndarray) -> np.ndarray:
-        """Return the largest dry friction of the joint with coefficients ``(P, K)``, ``(K,)``."""
-        signs = np.abs(self._terms()[:, self.friction]).max(axis=0)
-        return np.asarray(signs @ np.abs(theta[self.friction]))
-
-    def dry_friction(self) -> np.ndarray:
-        """Return the part of X theta that is dry friction of the own joint, ``(R,)``."""
-        rows = list(self.friction)
-        return np.asarray(self._terms()[:, rows] @ self.theta[rows, 0])
-
-    def _fitted(self, weights: np.ndarray) -> np.ndarray:
-        """Return coefficients for other weights of the windows, ``(1, B)``."""
-        rows = self.row_weights * np.sqrt(weights[0][self.window])[:, None]
-        rows = rows if self.resting is None else rows * ~self.resting[:, None]
-        regression = EquationOfMotionRegression(self.columns, 0 * self.window, rows)
-        return np.asarray(regression.fit("y", self.x).theta[0])
-
-    def _terms(self) -> np.ndarray:
-        return np.hstack([self.columns[name] for name in self.x])
-
-    def predicted(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return y and X theta, ``(R, K)`` each."""
-        return self.columns["y"], self._terms() @ self.theta
+    def predicted(self) -> np.ndarray:
+        """Return X theta, ``(R, K)``."""
+        return self.x @ self.theta
 
 
 @dataclass(frozen=True)
@@ -165,21 +221,50 @@ class Motion:
 
     Attributes:
         data: averages.
-        window: number of the window of each row, ``(R,)``.
-        equations: an equation of each input, or of v or a.
-        drawn: the equations of rigid bodies, if there is a robot, else the same.
+        equations: one of all joints, or one of each input, or of v or a.
+        numbers: numbers of the windows, ``(B,)``, by time: kernels of other widths have the same.
+        of_forces: the left sides are forces.
+        exact: the equation is one of all joints of a robot.
     """
 
     data: Averages
-    window: np.ndarray
     equations: Sequence[Equation]
-    drawn: Sequence[Equation]
+    numbers: np.ndarray
+    of_forces: bool = True
+    exact: bool = True
 
-    def residual(self, weights: Sequence[np.ndarray] | None = None) -> np.ndarray:
-        """Return the residual of each window of all equations, ``(B, K)``."""
-        used = [x.weights for x in self.equations] if weights is None else weights
-        pairs = zip(self.equations, used, strict=True)
-        return np.hstack([equation.of_windows(x) for equation, x in pairs])
+    @property
+    def labels(self) -> list[str]:
+        """Names of all left sides."""
+        return [label for x in self.equations for label in x.labels]
+
+    @property
+    def window(self) -> np.ndarray:
+        """Number of the window of each row, ``(R,)``."""
+        return self.equations[0].window
+
+    def residual(self, run: int | None = None) -> np.ndarray:
+        """Return the residual of each window, ``(B, K)``; of fits that include a run, if given."""
+        parts = []
+        for equation in self.equations:
+            theta = equation.theta
+            if run is not None:
+                of_run = np.bincount(self.window, self.data.run == run) > 0
+                theta = equation.fitted(np.where(of_run, 1.0, equation.weights))
+            parts.append(equation.residual(theta))
+        return np.hstack(parts)
+
+    def usual(self) -> np.ndarray:
+        """Return the residual of the median window that agrees, ``(K,)``."""
+        return np.hstack([x.usual() for x in self.equations])
+
+    def predicted(self) -> np.ndarray:
+        """Return X theta of all left sides, ``(R, K)``."""
+        return np.hstack([x.predicted() for x in self.equations])
+
+    def measured(self) -> np.ndarray:
+        """Return all left sides, ``(R, K)``."""
+        return np.hstack([x.y for x in self.equations])
 
 
 def windows(data: Averages, width: float) -> np.ndarray:
@@ -193,7 +278,11 @@ def windows(data: Averages, width: float) -> np.ndarray:
 
 
 def equations_of_motion(
-    data: Averages, q: Columns, u: Columns, width: float, rigid: Regressor | None = None
+    data: Averages,
+    q: Columns,
+    u: Columns,
+    width: float,
+    bodies: Regressor | None = None,
 ) -> Motion | None:
     """Return the equations of motion of a log; None if the rows are too few.
 
@@ -201,196 +290,144 @@ def equations_of_motion(
         data: averages, with the inputs at the times when they act.
         q, u: columns of coordinates and inputs.
         width: width of the widest kernel that is compared, s.
-        rigid: regressor of a rigid robot with one input per joint, or None.
+        bodies: regressor of all joints, of a robot with an input per joint, or None.
     """
     window = windows(data, width)
     data, window = data.rows(window >= 0), window[window >= 0]
-    size = len(u.columns)
     if not len(data):
         return None
-    equations: list[Equation] = []
-    drawn: list[Equation] = []
-    if size > len(q.columns):
-        inputs = data.u[:, :size]
-        inputs = (inputs - inputs.mean(axis=0)) / inputs.std(axis=0).clip(min=1e-300)
-        forms = [
-            _equation({"terms": terms(data, form), "inputs": inputs}, y, data, window, q.columns)
-            for form, y in (("increments", data.v), ("acceleration", data.a))
+    numbers, window = np.unique(window, return_inverse=True)
+    n, size = len(q.columns), len(u.columns)
+    data = replace(data, u=data.u[:, :size])  # no products of inputs
+    if size > n or not size:
+        equations = _of_states(data, q, window)
+    elif bodies is not None and size == n:
+        x = chain_columns(data, bodies)
+        first = x.shape[2] - OWN * n + OWN * np.arange(n)  # of each joint
+        friction, damping = first[:, None] + [3, 4, 5], first + 2
+        equations = [
+            _equation(data, x, data.u, u.columns, window, range(n), friction.tolist(), damping)
         ]
-        equations = [min(forms, key=lambda x: np.median(x.usual()))]
-    elif size:
-        regressor = bodies(data, rigid)
-        for i in range(size):
-            forms = [
-                _equation(
-                    force_columns(data, i, known),
-                    data.u[:, [i]],
-                    data,
-                    window,
-                    [u.columns[i]],
-                    joint=i if size == len(q.columns) else None,
-                )
-                for known in ([None] if regressor is None else [None, regressor])
-            ]
-            least = [float(x.usual()[0]) for x in forms]
-            # Rigid bodies judge motions well that no other run has, unless a force is missing.
-            drawn.append(forms[-1])
-            best = -1 if least[-1] < _WORSE * least[0] else 0
-            equations.append(replace(forms[best], of_bodies=best == -1 and len(forms) > 1))
     else:
-        columns = {"terms": terms(data, "acceleration")}
-        equations = [_equation(columns, data.a, data, window, q.columns)]
-    count = max(sum(x.columns[k].shape[1] for k in x.x) for x in equations)
-    if len(data) < _PER_TERM * count:
+        equations = []
+        for i in range(size):
+            columns = force_columns(data, i, None)
+            first, x = columns["terms"].shape[1], np.hstack(list(columns.values()))[:, None]
+            friction = [[first + i, first + n + i, first + 2 * n + i]]
+            own = ([i], friction, [1 + 4 * n + i]) if size == n else ()
+            equations.append(_equation(data, x, data.u[:, [i]], [u.columns[i]], window, *own))
+    rows, sides, count = equations[0].x.shape
+    if rows * sides < _PER_TERM * count:
         return None
-    return Motion(data, window, equations, drawn or equations)
+    exact = bodies is not None and size == n
+    return Motion(data, equations, numbers, 0 < size <= n, exact)
 
 
 def _equation(
-    x: dict[str, np.ndarray],
-    y: np.ndarray,
     data: Averages,
-    window: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
     labels: Sequence[str],
-    joint: int | None = None,
+    window: np.ndarray,
+    joints: Sequence[int] | None = None,
+    friction: Sequence[Sequence[int]] = (),
+    damping: Sequence[int] = (),
 ) -> Equation:
-    offset = np.median(y, axis=0)
-    columns = {**x, "y": y - offset, "u": data.u - np.median(data.u, axis=0)}
-    row_weights, resting = data.row_weights(), None
-    friction: list[int] = []
-    if joint is not None and data.moving[:, joint].sum() >= FEWEST:
-        resting = ~data.moving[:, joint]
-        size = x["terms"].shape[1]
-        joints = x["sign"].shape[1]
-        own = joint if joints > 1 else 0
-        friction = [size + own, size + joints + own, size + 2 * joints + own]
-    fitted = row_weights if resting is None else row_weights * ~resting[:, None]
-    regression = EquationOfMotionRegression(columns, window, fitted)
-    # A run in a larger unit would outweigh all others.
-    totals = np.hstack([regression.fit(name, list(x)).totals for name in ("y", "u")])
-    base = regression.spreads(totals).clip(min=1).max(axis=1) ** -2.0
-    weights = _weights(regression, list(x), base, _late(data, regression.block))
-    return Equation(
-        columns=columns,
-        x=list(x),
-        labels=labels,
-        window=regression.block,
-        theta=regression.fit("y", list(x), weights).theta[0],
-        weights=weights,
-        agree=weights[0] > _AGREES * base,
-        offset=offset,
-        row_weights=row_weights,
-        resting=resting,
-        friction=friction,
-    )
+    y = y - np.median(y, axis=0)
+    return Equation(data, x, y, labels, window, joints, friction, damping)
 
 
-def _late(data: Averages, block: np.ndarray) -> np.ndarray:
-    """Return the blocks in the later half of their run, ``(B,)``."""
-    rows = np.bincount(data.run).clip(min=1)
-    late = data.passed > (np.bincount(data.run, data.passed) / rows)[data.run]
-    return np.bincount(block, late) > np.bincount(block) / 2
-
-
-def _weights(
-    regression: EquationOfMotionRegression, x: list[str], base: np.ndarray, late: np.ndarray
-) -> np.ndarray:
-    """Return the weights of the windows from which most windows have the smallest residual.
-
-    The fits start from all windows, and from the earlier and the later half of each run: a payload
-    that is picked up in the middle changes half of the windows.
-    """
-    results = []
-    for start in (np.ones(len(base), dtype=bool), ~late, late):
-        if start.any():
-            weights = regression.robust_weights("y", x, base, start)
-            left = regression.residuals(regression.fit("y", x, weights)).max(axis=1)
-            results.append((float(np.quantile(left, _AGREE)), weights))
-    least, weights = min(results[1:], key=lambda result: result[0], default=results[0])
-    return weights if least < results[0][0] / _WORSE else results[0][1]
+def _of_states(data: Averages, q: Columns, window: np.ndarray) -> list[Equation]:
+    """Return equations of v or of a, whichever leaves less; of a without inputs."""
+    inputs = (data.u - data.u.mean(axis=0)) / data.u.std(axis=0).clip(min=1e-300)
+    forms, results = [("increments", data.v), ("acceleration", data.a)], []
+    for form, y in forms[data.u.shape[1] == 0 :]:
+        x = np.hstack([terms(data, form), inputs])[:, None]
+        pairs = zip(y.T[:, :, None], q.columns, strict=True)
+        results.append([_equation(data, x, side, [label], window) for side, label in pairs])
+    return min(results, key=lambda x: np.median([e.usual() for e in x]))
 
 
 def check_runs(
-    motions: Sequence[Motion | None],
-    names: Sequence[str],
-    *,
-    inverse: bool,
-    exact: bool = True,
+    narrow: Motion | None, wide: Motion | None, names: Sequence[str], *, exact: bool = True
 ) -> tuple[list[Measurement], list[Interval]]:
     """Compare the windows of each run with the equation of the others.
 
-    A window is odd if its residual is three times that of the median window, also if the fit
-    includes its run, and if it does not grow with the width of the kernel.
+    A window is odd if its residual is four times that of the median window, also if the fit
+    includes its run, if it does not grow with the width of the kernel, and if the next window is
+    odd, too.
 
     Args:
-        motions: equations with kernels of two widths; None if the rows are too few.
+        narrow, wide: equations with kernels of two widths; None if the rows are too few.
         names: names of the runs.
-        inverse: the equations are those of forces.
-        exact: the equations are not known to be wrong; else windows without a cause do not count.
+        exact: the equations are not known to be wrong; else parts without a cause do not count.
 
     Returns:
         Measurements, and the parts of runs that do not fit.
     """
-    narrow, wide = motions
     if narrow is None or wide is None:
         return [], []
-    labels = [label for x in narrow.equations for label in x.labels]
-    numbers, of_wide = np.unique(narrow.window), np.unique(wide.window)
-    residual, smooth = narrow.residual(), np.full((len(numbers), len(labels)), np.inf)
-    smooth[np.isin(numbers, of_wide)] = wide.residual()[np.isin(of_wide, numbers)]
-    usual = np.hstack([x.usual() for x in narrow.equations]).clip(min=_NOTICEABLE / _RATIO)
-    rows = narrow.equations[0].window
+    usual = narrow.usual()
+    residual, rows = narrow.residual(), narrow.window
+    odd = residual > _RATIO * usual
+    if odd.any():
+        both = np.isin(narrow.numbers, wide.numbers)
+        smooth = wide.residual()[np.isin(wide.numbers, narrow.numbers)]
+        growth = (smooth + 1e-12) / (residual[both] + 1e-12)
+        growth = growth if wide.data.width > narrow.data.width else 1 / growth
+        odd[both] &= growth < _OF_WIDTH
+        odd &= _in_a_row(odd)
     runs = narrow.data.run[np.unique(rows, return_index=True)[1]]  # of each window
-    limit = _FAR * usual
-    if not _follow(np.asarray((residual > limit).any(axis=1)), runs):
-        limit = np.maximum(_RATIO * usual, _RESIDUAL)
-    odd = (residual > limit) & (smooth < _OF_WIDTH * residual)
-    expected = f"below {_RATIO:g}"
-    results, parts = [], []
     share = odd.any(axis=1).mean()
-    few = share <= _ODD or (share < 1 - _AGREE and _follow(np.asarray(odd.any(axis=1)), runs))
-    for k in np.unique(runs) if few else ():
+    results, parts = [], []
+    for k in np.unique(runs[odd.any(axis=1)]) if share < 1 - _AGREE else ():
         # A motion that no other run has may be extrapolated badly: include it in the fit.
-        included = [np.where(runs == k, 1, x.weights) for x in narrow.equations]
-        again = narrow.residual(included)
-        least = np.maximum(_RATIO * usual, np.minimum(limit, _RESIDUAL)) / 1.5
-        bad = odd & (runs == k)[:, None] & (again > least)
+        bad = odd & (runs == k)[:, None] & (narrow.residual(k) > _RATIO / 1.5 * usual)
         bad &= _in_a_row(bad)
         if not bad.any():
             continue
         ratios = np.where(bad, residual / usual, 0)
         j = int(ratios.max(axis=0).argmax())
-        cause = _cause(narrow, bad.any(axis=1)[rows], j, labels, inverse)
-        times = narrow.data.t[bad.any(axis=1)[rows]]
-        if not cause and (bad.any(axis=1).sum() < _UNKNOWN_WINDOWS or not exact):
-            continue  # a generic equation is no exact one
+        all_odd = odd[rows, j] & (narrow.data.run == k)
+        cause = _cause(narrow, bad[rows, j], j) or _cause(narrow, all_odd, j)
+        times = narrow.data.t[bad[rows, j]]
+        if not cause and not (exact and narrow.exact and _certain(narrow, bad, odd)):
+            continue
         text = (
             f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
-            f"{times[-1]:.4g} s: the residual of {labels[j]!r} is {ratios[:, j].max():.3g} times "
-            f"that of the median window; {cause or _UNKNOWN} Correct or leave out this part"
+            f"{times[-1]:.4g} s: the residual of {narrow.labels[j]!r} is "
+            f"{ratios[:, j].max():.3g} times that of the median window; {cause or _UNKNOWN} "
+            "Correct or leave out this part"
         )
+        expected = f"below {_RATIO:g}"
         results.append(judged(RESIDUAL, names[k], ratios.max(), expected, True, text))
         parts.append(Interval(int(k), float(times[0]), float(times[-1])))
-    largest = float((residual / usual).max())
+    largest, expected = float((residual / usual).max()), f"below {_RATIO:g}"
     return results or [judged(RESIDUAL, "all runs", largest, expected, False, "")], parts
 
 
-def _follow(odd: np.ndarray, runs: np.ndarray) -> bool:
-    """Tell whether windows that are odd follow each other more often than by chance."""
-    same_run = np.diff(runs) == 0
-    switches = np.diff(odd.astype(int))[same_run] != 0
-    return len(switches) > 0 and bool(switches.mean() < odd.mean() * (1 - odd.mean()))
+def _certain(motion: Motion, bad: np.ndarray, odd: np.ndarray) -> bool:
+    """Tell whether four bad windows are in a row, and most odd rows are at poses of others.
+
+    Else a force that depends on the position may explain them, such as that of a hose.
+    """
+    rows = odd.any(axis=1)[motion.window]
+    low, high = motion.data.q[~rows].min(axis=0), motion.data.q[~rows].max(axis=0)
+    usual = ((motion.data.q[rows] >= low) & (motion.data.q[rows] <= high)).all(axis=1)
+    in_a_row = scipy.ndimage.binary_opening(bad.any(axis=1), np.ones(_UNKNOWN_WINDOWS))
+    return bool(in_a_row.any() and usual.mean() > 0.5)
 
 
 def check_rests(
-    motions: Sequence[Motion | None], names: Sequence[str]
+    narrow: Motion | None, wide: Motion | None, names: Sequence[str]
 ) -> tuple[list[Measurement], list[Interval]]:
     """Find parts in which all joints rest, although the inputs exceed their dry friction.
 
     Kernels of two widths must agree on a part.
     """
-    narrow, wide = (_held_parts(x) for x in motions)
-    parts = [x for x in narrow if any(x.run == y.run and x.meets(y) for y in wide)]
+    parts = _held_parts(narrow)
+    others = _held_parts(wide) if parts else []
+    parts = [x for x in parts if any(x.run == y.run and x.meets(y) for y in others)]
     if not parts:
         return [judged(HELD, "all runs", 0.0, "0", False, "")], []
     first, more = parts[0], f" and {len(parts) - 1} more parts" if len(parts) > 1 else ""
@@ -405,18 +442,17 @@ def check_rests(
 
 def _held_parts(motion: Motion | None) -> list[Interval]:
     """Return rests in which an input exceeds the dry friction at poses of other motions."""
-    if motion is None:
+    if motion is None or motion.equations[0].joints is None:
         return []
     data = motion.data
     pushed, moving = np.zeros(len(data), dtype=bool), data.moving.any(axis=1)
     for equation in motion.equations:
-        count = equation.theta.shape[0]
-        if equation.resting is None or (~equation.resting).sum() < _PER_TERM * count:
+        if (~equation.resting).sum() < _PER_TERM * equation.x.shape[2]:
             return []
-        y, explained = equation.predicted()
-        left = np.abs(y - explained)[:, 0]
-        level = _RATIO / 2 * equation.friction_level(equation.theta)[0]
-        pushed |= left > level + _RATIO * np.median(left[moving])
+        left = np.abs(equation.y - equation.predicted())
+        level = _RATIO / 2 * equation.friction_level(equation.theta)
+        usual = np.median(left[moving], axis=0)
+        pushed |= (equation.resting & (left > level + _RATIO * usual)).any(axis=1)
     low, high = data.q[moving].min(axis=0), data.q[moving].max(axis=0)
     pushed &= ~moving & ((data.q >= low) & (data.q <= high)).all(axis=1)
     edges = np.flatnonzero(np.diff(np.r_[False, pushed, False])).reshape(-1, 2)
@@ -431,39 +467,45 @@ def _in_a_row(bad: np.ndarray) -> np.ndarray:
     return before | after
 
 
-def _cause(motion: Motion, rows: np.ndarray, j: int, labels: Sequence[str], inverse: bool) -> str:
+def _cause(motion: Motion, rows: np.ndarray, j: int) -> str:
     """Return the likely cause in rows whose left side j does not fit; "" if none fits."""
-    u = motion.data.u
-    inputs = range(u.shape[1])
-    pairs = [x.predicted() for x in motion.equations]
-    measured, predicted = (np.hstack(x)[rows] for x in zip(*pairs, strict=True))
+    data, labels, inverse = motion.data, motion.labels, motion.of_forces
+    inputs = range(data.u.shape[1])
     for i in inputs[j : j + 1] if inverse else inputs:
-        values = u[rows, i]
-        if motion.data.moving_rows(i)[rows].mean() < 0.5:
+        values = data.u[rows, i]
+        if data.moving_rows(i)[rows].mean() < 0.5:
             continue
-        if np.ptp(u[:, i]) > 0 and np.isclose(values, np.median(values), 1e-6, 0).mean() > 0.5:
+        if np.ptp(data.u[:, i]) > 0 and np.isclose(values, np.median(values), 1e-6, 0).mean() > 0.5:
             if not np.median(values):
                 return f"input {i + 1} is 0 there although the robot moves: is it moved by hand?"
             return f"input {i + 1} is constant there: is a sensor stuck?"
+    measured, predicted = motion.measured(), motion.predicted()
     name = f"{labels[j]!r}"
     if inverse:
-        offset = np.concatenate([x.offset for x in motion.equations])
-        pairs = [x.predicted() for x in motion.equations]
-        left = np.abs(np.hstack([a - b for a, b in pairs]))
+        left = np.abs(measured - predicted)
         # The usual residual, and that without input in these rows.
-        usual, without = np.median(left, axis=0), np.median(np.abs(predicted + offset), axis=0)
+        usual = np.median(left, axis=0)
+        without = np.median(np.abs(predicted + data.u - measured)[rows], axis=0)
         if without[j] < _RATIO * usual[j] < np.median(left[rows, j]):
             idle = listed(
                 x for x, a, b in zip(labels, without, usual, strict=True) if a < _RATIO * b
             )
             return f"the motion is that without input: {idle} do not act there, is the drive off?"
+        friction = np.hstack([x.dissipation() for x in motion.equations])
+        forwards = np.abs(measured - predicted + 2 * friction)[rows]
+        if (np.median(forwards, axis=0) < np.median(left[rows], axis=0) / _RATIO).all():
+            return "its friction pushes forwards there: does the time run backwards?"
+    elif not inputs:
+        return ""
     else:
-        x = motion.equations[0]
-        effect = x.columns["inputs"][rows] @ x.theta[-x.columns["inputs"].shape[1] :]
-        measured, predicted = effect, measured - predicted + effect
+        equation = motion.equations[j]
+        effect = equation.x[:, 0, -len(inputs) :] @ equation.theta[-len(inputs) :]
+        measured = measured - predicted
+        measured[:, j] += effect
+        predicted = np.tile(effect[:, None], len(labels))
         name = f"the effect of the inputs on {labels[j]!r}"
     # The mean of a torque in another unit is far from that of the other runs.
-    measured, predicted = (x - x.mean(axis=0) for x in (measured, predicted))
+    measured, predicted = (x[rows] - x[rows].mean(axis=0) for x in (measured, predicted))
     sizes = (np.linalg.norm(x, axis=0).clip(min=1e-300) for x in (measured, predicted))
     product = measured.T @ predicted
     match = product / np.outer(*sizes)
@@ -475,73 +517,3 @@ def _cause(motion: Motion, rows: np.ndarray, j: int, labels: Sequence[str], inve
         return ""
     cause = "is its sign reversed" if scale < 0 else "is it in another unit"
     return f"{name} is {scale:.3g} times what the equation of the others predicts: {cause}?"
-
-
-def check_signs(
-    motion: Motion | None,
-    u: Columns,
-    curves: Sequence[DelayCurve],
-    rigid: Regressor | None = None,
-) -> list[Measurement]:
-    """Measure the effective inertia and the mean power of each force or torque.
-
-    Both are positive at the joint that the force drives: M(q) is positive definite, and the robot
-    dissipates. With fewer forces than coordinates this is the joint whose power fits an energy. A
-    dry friction that is clearly negative is a sign error, too.
-    """
-    if motion is None or not 0 < len(u.columns) <= motion.data.q.shape[1]:
-        return []
-    if not set(u.units) <= _FORCES:
-        return []
-    data, n = motion.data, motion.data.q.shape[1]
-    directions, square = np.eye(n), n == len(u.columns)
-    few = np.arange(len(data)) % max(1, len(data) // _SIGN_ROWS) == 0
-    results = []
-    for i, (name, equation) in enumerate(zip(u.columns, motion.equations, strict=True)):
-        weights = equation.weights[0, equation.window][few]
-        power = (data.u[:, [i]] * data.v)[few]
-        shares = (weights @ power) / (weights @ np.abs(power)).clip(min=1e-300)
-        k = i if square else driven_joint(data, i)
-        driven, columns, theta = data, equation.columns, equation.theta[:, 0]
-        if not square:  # The accelerations of passive joints follow from that of the driven joint.
-            driven = replace(data, a=directions[k] * data.a)
-            columns = {**force_columns(driven, i, None), "y": columns["y"]}
-            regression = EquationOfMotionRegression(columns, motion.window, data.row_weights())
-            theta = regression.fit("y", equation.x, equation.weights).theta[0, :, 0]
-        x = np.hstack([columns[key][few] for key in equation.x])
-        moved = driven.rows(few)
-        moved = replace(moved, a=moved.a + directions[k])
-        pushed = force_columns(moved, i, bodies(moved, rigid if equation.of_bodies else None))
-        inertia = (np.hstack([pushed[key] for key in equation.x]) - x) @ theta
-        left = columns["y"][few, 0] - x @ theta
-        smallest = max(2 * np.std(left), _NOTICEABLE * np.std(columns["y"]))
-        clear = np.std(inertia * data.a[few, k]) > smallest
-        positive = weights @ (inertia > 0) / weights.sum()
-        bad = bool(clear and positive < 0.1 and shares[k] < 0.2)
-        curve = curves[i] if curves and square else None
-        if curve is not None and curve.delay is not None:
-            reversed_friction = curve.friction < -0.05 - 4 * curve.friction_spread
-            bad = bad or bool(reversed_friction and shares[k] < 0)
-        text = (
-            f"input {name!r} seems to push backwards: the effective inertia of coordinate {k + 1} "
-            f"is {weights @ inertia / weights.sum():.3g} and its mean power "
-            f"{weights @ power[:, k] / weights.sum():.3g} W, expected above 0: is it reversed?"
-        )
-        measured = (INERTIA, name, positive)
-        results.append(judged(*measured, "above 0.1 where it is clear", bad, text))
-    return results
-
-
-def driven_joint(data: Averages, i: int) -> int:
-    """Return the joint k whose power u_i v_k is that of an energy E(q, v) and friction."""
-    data = data.independent(1.0)
-    power = data.u[:, [i]] * data.v
-    inside = np.diff(data.stretch) == 0
-    energies = np.diff(terms(data, "acceleration"), axis=0)
-    heats = np.hstack([data.v**2, np.abs(data.v)])
-    columns = {
-        "terms": np.hstack([energies, heats[1:] + heats[:-1]])[inside],
-        "power": (power[1:] + power[:-1])[inside],
-    }
-    regression = EquationOfMotionRegression(columns, np.zeros(inside.sum(), dtype=int))
-    return int(regression.fit("power", ["terms"]).shares()[0].argmin())

@@ -43,7 +43,8 @@ _TRIED = 3  # inputs with the largest residuals that causes have to explain
 _WHITE = 0.8  # residual with a wide kernel over that with a narrow one, of noise
 _ANGLES = np.linspace(-np.pi, np.pi, 12, endpoint=False)  # rad, of homing offsets
 _FACTORS = [1.0, *(x**k for x in (1.4, 2.0, 3.0, 5.0, 10.0) for k in (1, -1))]  # of gears
-_REFINED, _TRIALS = 2, 30  # joints whose factor and offset are refined; trials of each
+_TRIALS = 60  # of a factor and an offset
+_ENOUGH = 0.1  # unexplained share with a cause over that without, at which no more are tried
 _CHUNK = 500  # rows of a call of a regressor, for its memory
 _SCALE = 2.5  # of torques over those of the URDF's bodies
 _CERTAIN = 0.1  # largest standard error of a scale, as a share of it
@@ -202,17 +203,25 @@ def _left_of_held_out(cause: _Cause, joints: Sequence[int]) -> float:
 
 
 def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -> str:
-    """Return the causes that leave least of the inputs, in words; "" if none leaves much less."""
+    """Return the causes that leave least of the inputs, in words; "" if none leaves much less.
+
+    Causes that need a search are tried if simpler ones leave a part.
+    """
     data = data.thinned(_FEW)
-    plain = _Cause("", data, regressor(structure)(data.q, data.v, data.a))
-    causes = sorted(_causes(structure, plain, joints), key=lambda cause: _left(cause, joints))
-    causes = [cause for cause in causes[:_BEST] if np.isfinite(_left(cause, joints))]
-    totals = np.array([_left_of_held_out(cause, joints) for cause in causes])
+    rigid = regressor(structure)
+    plain = _Cause("", data, rigid(data.q, data.v, data.a))
+    total, candidates = _left(plain, joints), []
+    for causes in (_causes, _offsets, _gears):
+        candidates += [(_left(x, joints), x) for x in causes(structure, plain, joints)]
+        if min(left for left, _ in candidates) < _ENOUGH * total:
+            break
+    best = [x for left, x in sorted(candidates, key=lambda x: x[0])[:_BEST] if np.isfinite(left)]
+    totals = np.array([_left_of_held_out(cause, joints) for cause in best])
     if not totals.min(initial=np.inf) < _EXPLAINS * _left_of_held_out(plain, joints):
         return ""
     # In a plane, the mirror image of a reversed joint is the other joint reversed.
     ties = np.flatnonzero(totals < max(_TIE * totals.min(), 1e-6))
-    return "; or ".join(dict.fromkeys(causes[k].text for k in ties))
+    return "; or ".join(dict.fromkeys(best[k].text for k in ties))
 
 
 def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iterator[_Cause]:
@@ -234,7 +243,6 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
         springs = wording.setting("model.springs", [name])
         text = f"a spring at joint {name} explains it: fit it with {springs}"
         yield replace(plain, text=text, extra=(k, data.q[:, k]))
-    yield from _affine(plain, rigid, names, joints)
     for i in range(size):
         for j in range(size):
             pair = f"{names[j]} and {names[i]}"
@@ -271,59 +279,90 @@ def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iter
                 yield cause
 
 
-def _affine(
-    plain: _Cause, rigid: Regressor, names: Sequence[str], joints: Sequence[int]
-) -> Iterator[_Cause]:
-    """Return the best factor and offset of the coordinates that they explain best."""
-    data = plain.data
+def _moved(plain: _Cause, rigid: Regressor, k: int, factor: float, offset: float) -> _Cause:
+    """Return the cause that q of joint k is a multiple of that of the robot, plus an offset."""
+    k_alone = np.arange(plain.data.q.shape[1]) == k
+    motion = _scaled(plain.data, np.where(k_alone, 1 / factor, 1.0))
+    motion = replace(motion, q=motion.q + offset * k_alone)
+    return replace(plain, data=motion, bodies=rigid(motion.q, motion.v, motion.a))
 
-    def changed(k: int, factor: float, offset: float) -> _Cause:
-        k_alone = np.arange(data.q.shape[1]) == k
-        motion = _scaled(data, np.where(k_alone, 1 / factor, 1.0))
-        motion = replace(motion, q=motion.q + offset * k_alone)
-        return _Cause("", motion, rigid(motion.q, motion.v, motion.a))
+
+def _offset(
+    plain: _Cause, structure: RigidChain, k: int, factor: float, joints: Sequence[int]
+) -> tuple[float, float]:
+    """Return what the best offset of joint k leaves, and the offset.
+
+    The torque of bodies is of degree 2 in sin and cos of an angle, or in the position of a slide:
+    five offsets tell that of all others.
+    """
+
+    def basis(x: float) -> list[float]:
+        if structure.turning[k]:
+            return [1.0, np.cos(x), np.sin(x), np.cos(2 * x), np.sin(2 * x)]
+        return [1.0, x, x**2, x**3, x**4]
+
+    rigid, nodes = regressor(structure), 2 * np.pi * np.arange(-2, 3) / 5
+    causes = [_moved(plain, rigid, k, factor, x) for x in nodes]
+    bodies, weights = np.array([x.bodies for x in causes]), np.linalg.inv([basis(x) for x in nodes])
+
+    def left(x: float) -> float:
+        values = np.tensordot(basis(x) @ weights, bodies, 1)
+        return _left(replace(causes[2], bodies=values), joints)
+
+    _, start = min((left(x), x) for x in _ANGLES)
+    bounds = start - _ANGLES[1] + _ANGLES[0], start + _ANGLES[1] - _ANGLES[0]
+    fit = scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded")
+    return float(fit.fun), float(fit.x)
+
+
+def _offsets(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iterator[_Cause]:
+    for k, name in enumerate(structure.joint_names):
+        _, offset = _offset(plain, structure, k, 1.0, joints)
+        cause = _moved(plain, regressor(structure), k, 1.0, offset)
+        yield replace(cause, text=_off(name, offset))
+
+
+def _off(name: str, offset: float) -> str:
+    return (
+        f"{name} is {-offset:.3g} off: add {offset:.3g} to its column, or correct the origin of "
+        "the joint"
+    )
+
+
+def _gears(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iterator[_Cause]:
+    """Return the best factor of q of a joint, and the best offset beside it."""
+    rigid = regressor(structure)
 
     def left(k: int, factor: float, offset: float) -> float:
-        return _left(changed(k, factor, offset), joints)
+        return _left(_moved(plain, rigid, k, factor, offset), joints)
 
     starts = []
-    for k in range(len(names)):
+    for k in range(structure.num_coordinates):
         _, factor = min((left(k, x, 0.0), x) for x in _FACTORS)
-        starts.append(min((left(k, factor, x), k, factor, x) for x in _ANGLES))
-    for _, k, factor, offset in sorted(starts)[:_REFINED]:
-        name, fits = names[k], []
-        # A factor or an offset alone, if both explain no more.
-        for fixed in ((1.0, None), (None, 0.0), (None, None)):
-            free = [x is None for x in fixed]
-
-            def values(x: np.ndarray, free: list[bool] = free) -> tuple[float, float]:
-                both = np.array([0.0, 0.0])
-                both[free] = x
-                return float(np.exp(both[0])), float(both[1])
-
-            start = np.array([np.log(factor), offset])[free]
-            simplex = np.vstack([start, start + np.diag([0.15, 0.25])[free][:, free]])
-            options = {"maxfev": _TRIALS, "initial_simplex": simplex}
-            fit = scipy.optimize.minimize(
-                lambda x, k=k, values=values: left(k, *values(x)),
-                start,
-                method="Nelder-Mead",
-                options=options,
-            )
-            fits.append((fit.fun, *values(fit.x)))
-        least = min(x[0] for x in fits)
-        _, factor, offset = next(x for x in fits if x[0] <= max(_TIE * least, 1e-6))
-        parts = []
-        if factor != 1.0:
-            parts.append(
-                f"q and v of joint {name} are {factor:.3g} times those of the URDF, as by a gear"
-            )
-        if offset:
-            parts.append(
-                f"{name} is {-offset * factor:.3g} off: add {offset * factor:.3g} to its column, "
-                "or correct the origin of the joint"
-            )
-        yield replace(changed(k, factor, offset), text=", and ".join(parts))
+        least, offset = _offset(plain, structure, k, factor, joints)
+        starts.append((least, k, factor, offset))
+    _, k, factor, offset = min(starts)
+    near = np.log(factor) + np.array([-0.3, 0.3])
+    alone = scipy.optimize.minimize_scalar(
+        lambda x: left(k, np.exp(x), 0.0), bounds=near, method="bounded"
+    )
+    both = scipy.optimize.minimize(
+        lambda x: left(k, np.exp(x[0]), x[1]),
+        [np.log(factor), offset],
+        method="Nelder-Mead",
+        options={
+            "maxfev": _TRIALS,
+            "initial_simplex": [np.log(factor), offset] + np.array([[0, 0], [0.15, 0], [0, 0.25]]),
+        },
+    )
+    factor, offset = np.exp(both.x[0]), both.x[1]
+    if alone.fun <= max(_TIE * both.fun, 1e-6):
+        factor, offset = np.exp(alone.x), 0.0
+    name = structure.joint_names[k]
+    text = f"q and v of joint {name} are {factor:.3g} times those of the URDF, as by a gear"
+    if offset:
+        text += f", and {_off(name, offset * factor)}"
+    yield replace(_moved(plain, rigid, k, factor, offset), text=text)
 
 
 def _scaled(data: Averages, scale: np.ndarray) -> Averages:

@@ -317,15 +317,27 @@ def test_mcap_of_protobuf(tmp_path):
     assert_motion(read(tmp_path / "run.mcap", columns, "/arm"), shift=0.5)
 
 
-def test_an_mcap_of_a_crashed_recorder_is_read_to_its_end(tmp_path):
+def cut(data):
+    """The file of a recorder that crashed."""
+    return data[: len(data) // 2]
+
+
+def flipped(data):
+    """A file with a damaged chunk in its middle; chunks begin with the number of Zstandard."""
+    first = data.index(b"\x28\xb5\x2f\xfd", len(data) // 2) + 20
+    return data[:first] + bytes(x ^ 255 for x in data[first : first + 40]) + data[first + 40 :]
+
+
+@pytest.mark.parametrize("damage", [cut, flipped])
+def test_a_damaged_mcap_is_read_up_to_there_and_says_so(tmp_path, damage):
     messages = [json.dumps({"q": q.tolist(), "u": u.tolist()}) for q, u in zip(Q, U, strict=True)]
     path = tmp_path / "run.mcap"
     write_mcap(path, ("Arm", "jsonschema", b"{}"), "json", [x.encode() for x in messages])
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    path.write_bytes(damage(path.read_bytes()))
     table = read(path, [f"/arm/{x}/{k}" for x in "qu" for k in (0, 1)], "/arm")
     assert 100 < len(table) < 200
     assert_motion(table, slice(len(table)))
-    assert "no end" in table.notes[0]
+    assert "damaged or has no end" in table.notes[0]
 
 
 def test_the_files_of_a_bag_without_metadata_are_found(tmp_path):

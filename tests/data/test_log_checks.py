@@ -19,7 +19,7 @@ from pinn_dyn.data.logs import (
 from pinn_dyn.data.logs.check.checks import _are_ticks
 from pinn_dyn.data.logs.registers import rows_before_first_sample
 from pinn_dyn.log_check.check import check
-from pinn_dyn.log_check.runs import INERTIA
+from pinn_dyn.log_check.chain import SIGN
 from tests.data.logs_files import motion, source, write
 
 RESAMPLE = {"resample": Resample(rate=100.0, max_gap=0.2)}
@@ -40,7 +40,7 @@ def warned(folder, table, **changes):
 def checked(folder, table):
     """Texts of the check of a log about units of angles and signs of forces."""
     write(folder, table)
-    names = ("largest angle [rad]", INERTIA)
+    names = ("largest angle [rad]", SIGN)
     found = [x for x in check(source(folder)).measurements if x.verdict != "ok"]
     return "\n".join(x.text for x in found if x.name in names)
 
@@ -234,11 +234,14 @@ def changed(**columns):
 
 
 def random_force(sign):
-    """A force that the position does not explain, and the motion that follows from it."""
-    levels = np.random.default_rng(0).normal(size=44)
-    force = np.interp(T, np.arange(0, 11, 0.25), levels)
-    v = np.cumsum(force) * 0.01
-    return changed(v1=v, q1=np.cumsum(v) * 0.01, u1=sign * force)
+    """Two masses, and forces that their positions do not explain; the first has a sign."""
+    columns = {}
+    for k, factor in ((1, sign), (2, 1)):
+        levels = np.random.default_rng(k).normal(size=44)
+        force = np.interp(T, np.arange(0, 11, 0.25), levels)
+        v = np.cumsum(force) * 0.01
+        columns |= {f"v{k}": v, f"q{k}": np.cumsum(v) * 0.01, f"u{k}": factor * force}
+    return changed(**columns)
 
 
 def resting():
@@ -333,7 +336,7 @@ def test_the_check_names_degrees_and_a_reversed_force(tmp_path):
     degrees = changed(q2=np.degrees(Q2), v2=np.degrees(V2))
     assert re.match("run, column 'q2': an angle of ", checked(tmp_path, degrees))
     assert checked(tmp_path, random_force(1)) == ""
-    assert "input 'u1' seems to push backwards" in checked(tmp_path, random_force(-1))
+    assert "input 'u1' seems to push joint 1 backwards" in checked(tmp_path, random_force(-1))
 
 
 def test_a_joint_that_turns_many_times_is_not_in_degrees(tmp_path):
@@ -425,3 +428,9 @@ def test_bursts_of_stamps_are_warned_of_and_a_row_clock_repairs_them(tmp_path, a
     assert float(splits.train[0].t[1]) == pytest.approx(0.01, rel=1e-3)
     lost = in_bursts().drop(index=range(300, 360))
     refused(tmp_path, lost, r"RowClock found the stamp .* rows are missing.*SplitGaps", steps=steps)
+
+
+def test_a_packed_file_is_to_be_unpacked(tmp_path):
+    (tmp_path / "run.zip").write_bytes(b"PK")
+    with pytest.raises(LogError, match=r"no reader for '.zip': unpack it, and name the files"):
+        source(tmp_path, files="run.zip").load()

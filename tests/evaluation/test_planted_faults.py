@@ -11,8 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from pinn_dyn.data.logs import LogSource
+from pinn_dyn.log_check.chain import EXCHANGED, SIGN
 from pinn_dyn.log_check.check import check
-from pinn_dyn.log_check.runs import HELD, INERTIA, RESIDUAL
+from pinn_dyn.log_check.runs import HELD, RESIDUAL
 from pinn_dyn.log_check.structure import FIT, SCALE
 from pinn_dyn.systems import RigidChain
 from tests.support import delayed_robots, underactuated
@@ -228,12 +229,12 @@ PLANTED = {
     # Fault: runs, URDF or not, name of the only bad measurement, words of its texts.
     "all inputs late": (lambda: arm_runs(delay=0.03), False, DELAY, ["'u1'", "'u2'", "'u3'"]),
     "an input late": (lambda: arm_runs(delay=(0, 0.015, 0)), True, DELAY, ["'u2' acts"]),
-    "torque reversed": (lambda: edited(times(-1, "u2")), False, INERTIA, ["'u2' seems"]),
+    "torque reversed": (lambda: edited(times(-1, "u2")), False, SIGN, ["'u2' seems"]),
     "torques exchanged": (
         lambda: edited(exchanged("u")),
         True,
-        FIT,
-        ["inputs of the joints joint0"],
+        EXCHANGED,
+        ["the inputs 'u1' and 'u2' are"],
     ),
     "clock 2 %": (lambda: edited(clock(0.02)), False, DRIFT, ["'u1' drifts by", "too early"]),
     "drive saturates": (lambda: edited(commanded), False, SATURATED, ["'u2' is a command"]),
@@ -436,7 +437,7 @@ def test_a_bad_run_of_a_robot_with_more_inputs_than_coordinates():
 def pushed_backwards(runs, columns):
     """Inputs that are said to push backwards if the columns are reversed."""
     reverse = {name: x.assign(**{c: -x[c] for c in columns}) for name, x in runs.items()}
-    return [x.split("'")[1] for x in read(reverse)[INERTIA]]
+    return [x.split("'")[1] for x in read(reverse)[SIGN]]
 
 
 def closed_loop(seed, gravity=False):
