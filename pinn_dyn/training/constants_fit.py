@@ -37,6 +37,7 @@ class Fit:
         prior: prior of z.
         residual: root mean square of the normalized data residuals.
         iterations: number of Gauss-Newton steps.
+        success: false if the kept stage ended at its largest number of evaluations.
         z: the fitted z, ``(P,)``.
         stage: stage of the fit that found z.
         errors: smallest validation errors of the stages, ``(V,)``, or NaN.
@@ -51,6 +52,7 @@ class Fit:
     prior: Prior
     residual: float
     iterations: int
+    success: bool = True
     z: Tensor | None = None
     stage: str = ""
     errors: Tensor = UNKNOWN

@@ -59,8 +59,10 @@ class GaussNewton:
         self._radius, self._weight = 1.0, 0.0
         self._move(z, self._residuals(z), _FIRST_NOISE)
 
-    def minimize(self, limit: int, tolerance: float, report: Callable[[], None]) -> None:
+    def minimize(self, limit: int, tolerance: float, report: Callable[[], None]) -> bool:
         """Step until a step decreases the cost by less than a tolerance, or is expected to.
+
+        Return whether the minimum was reached before ``limit`` evaluations.
 
         The cost is minus twice the logarithm of a probability: at the true z, it exceeds the
         minimum by chi^2 with P degrees of freedom, whose standard deviation is sqrt(2 P). No more
@@ -70,11 +72,13 @@ class GaussNewton:
         while True:
             predicted = self._linearize()
             if min(decrease, predicted) < tolerance:
-                return
+                return True
             decrease = 0.0
             while not decrease > 0:
-                if self.evaluations >= limit or predicted < tolerance:
-                    return
+                if predicted < tolerance:
+                    return True
+                if self.evaluations >= limit:
+                    return False
                 decrease, predicted = self._step()
                 report()
 

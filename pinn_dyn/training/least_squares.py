@@ -417,15 +417,23 @@ class LeastSquares:
 
         with Progress(task, limit, "evaluations or fewer") as progress:
             try:
-                problem.minimize(limit, tolerance * (2 * len(z)) ** 0.5, report)
+                success = problem.minimize(limit, tolerance * (2 * len(z)) ** 0.5, report)
             finally:
                 vector_to_parameters(problem.z, model.parameters())
-        log.info("%s: residual %.4f after %d steps", task, problem.noise, problem.steps)
+        way = "" if success else f", stopped by evaluations={limit} before the minimum"
+        log.info("%s: residual %.4f after %d steps%s", task, problem.noise, problem.steps, way)
         scores = block_scores(problem.slopes, problem.data, partitions, prior.root)
         information = problem.slopes.T @ problem.slopes
         covariance = posterior_covariance(information, prior.root, scores)
         result = Fit(
-            covariance, information, prior, problem.noise, problem.steps, problem.z, scores=scores
+            covariance=covariance,
+            information=information,
+            prior=prior,
+            residual=problem.noise,
+            iterations=problem.steps,
+            success=success,
+            z=problem.z,
+            scores=scores,
         )
         if parts is None:
             return result

@@ -35,7 +35,7 @@ def test_the_minimum_is_that_of_scipy(robust):
     prior = Prior(zero, 1e-3 * torch.eye(3, dtype=torch.float64))
     problem = GaussNewton(evaluate, zero, prior, 1.0, robust)
     reports = []
-    problem.minimize(100, 1e-9, lambda: reports.append(problem.noise))
+    assert problem.minimize(100, 1e-9, lambda: reports.append(problem.noise))
     loss = {"loss": "soft_l1", "f_scale": problem.scale} if robust else {}
     expected = scipy.optimize.least_squares(residuals, TRUTH, xtol=1e-12, ftol=1e-12, **loss)
     np.testing.assert_allclose(problem.z, expected.x, rtol=1e-3)
@@ -50,7 +50,7 @@ def test_the_limit_of_evaluations_ends_with_the_best_z():
     zero = torch.zeros(3, dtype=torch.float64)
     problem = GaussNewton(evaluate, zero, Prior(zero, torch.eye(3).double()), 1.0, True)
     before = problem.noise
-    problem.minimize(3, 1e-9, lambda: None)
+    assert not problem.minimize(3, 1e-9, lambda: None)
     assert problem.evaluations == 3
     assert float(evaluate(problem.z, False).square().mean()) == pytest.approx(problem.noise**2)
     assert problem.noise < before

@@ -352,7 +352,7 @@ def test_a_later_stage_is_kept_unless_it_is_clearly_worse(runs, monkeypatch, cha
             next(model.parameters()).fill_(next(number))
         z = parameters_to_vector(model.parameters()).detach()
         eye = torch.eye(len(z)).to(z)
-        return Fit(eye, eye, Prior(0 * z, eye), 0.1, 1, z.clone())
+        return Fit(eye, eye, Prior(0 * z, eye), 0.1, 1, z=z.clone())
 
     monkeypatch.setattr(LeastSquares, "_solve", solved)
     errors = iter([torch.ones(4), *(1 + torch.tensor(x) for x in changes)])
