@@ -91,7 +91,7 @@ def _holds(arrays: Arrays, prove: Callable[[Arrays], np.ndarray] | None, path: P
         if np.allclose(present, stored, rtol=_ROUNDING, atol=scale, equal_nan=True):
             return True
     log.warning(
-        "the recording %s does not follow the present code of its robot and excitation: "
+        "the recording %s differs from the current code of its robot and excitation: "
         "it is made again",
         path,
     )

@@ -251,7 +251,9 @@ class SimulatedSource(RecordedSource):
             ("input_labels", self.input_labels, self.system.num_inputs),
         ):
             if len(values) != expected:
-                raise ValueError(f"{self.name}: {key} has {len(values)} entries, not {expected}")
+                raise ValueError(
+                    f"{self.name}: {key} has {len(values)} entries, expected {expected}"
+                )
         if isinstance(self.system, HasDomain):
             self.system.check_domain(*np.array(self.q_limits or [states.q_low, states.q_high]))
         self.angles = tuple(getattr(self.system, "angles", ()))

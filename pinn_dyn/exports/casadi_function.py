@@ -70,7 +70,7 @@ def write_casadi(functions: Sequence[Any], path: Path, info: str, real: str) -> 
         ValueError: if ``real`` is ``"float"``.
     """
     if real != "double":
-        raise ValueError(f"{path}: CasADi computes with doubles: set real='double', or write a .c")
+        raise ValueError(f"{path}: CasADi computes with doubles: set real='double', or use .c")
     (function,) = functions
     casadi_function(function.program, function.name).save(str(path))
     loaded = import_casadi().Function.load(str(path))

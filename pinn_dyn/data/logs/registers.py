@@ -39,8 +39,8 @@ def check_registers(table: Table, signal: str, columns: Columns, values: np.ndar
                 row, period = int(upper.argmax()), 2**bits * step
                 raise LogError(
                     f"{table.place(row, name, signal)}: {raw[row]:.6g} is a negative number of an "
-                    f"unsigned register of {bits} bits ({int(upper.sum())} such rows): subtract "
-                    f"{period:.6g} from all values above {period / 2:.6g} before"
+                    f"unsigned register of {bits} bits ({int(upper.sum())} such rows): first "
+                    f"subtract {period:.6g} from all values above {period / 2:.6g}"
                 )
 
 

@@ -127,7 +127,7 @@ class LogSource(DataSource):
         self.delay = delay
         self._repairs = {fault for step in self.steps.values() for fault in step.repairs}
         if (validation is None) != (test is None):
-            raise LogError("expected both validation and test, or neither for the default split")
+            raise LogError("set both validation and test, or neither for the default split")
         self.validation: Any = validation and validated(Part, "validation", validation)
         self.test: Any = test and validated(Part, "test", test)
         self.guard = guard
