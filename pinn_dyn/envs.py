@@ -1,4 +1,4 @@
-"""Robots as environments for reinforcement learning, with the interface of Gymnasium."""
+"""Robots as Gymnasium environments for reinforcement learning."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ except ImportError as error:
     raise ImportError(text) from error
 
 Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
-"""Reward of a step, from q and v after it, ``(N,)`` each, and the input ``(M,)``."""
+"""Reward of a step, from q and v ``(N,)`` at its end, and the input ``(M,)``."""
 Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Rewards of K robots ``(K,)``, from q and v after a step, ``(K, N)`` each, and u ``(K, M)``."""
+"""Rewards ``(K,)`` of K robots, from q and v ``(K, N)`` at the end of a step, and u ``(K, M)``."""
 
 _SAMPLES = 200  # states per trajectory
 
 
 class ModelPlant(Plant):
-    """K copies of a learned robot, integrated as in its training; inputs are zero before the start.
+    """K copies of a learned robot, integrated as in its training.
 
-    A loop in C is used as soon as it pays off, see :class:`~pinn_dyn.exports.c_loop.CLoop`. Changes
-    of the model count from the next start on.
+    Inputs are zero before the start. A loop in C is used when it pays off, see
+    :class:`~pinn_dyn.exports.c_loop.CLoop`. Changes of the model have an effect at the next start.
 
     Args:
         model: the learned system.
         step: longest step of the integration, s.
-        delay: time between an input and its action, ``(M,)``, s; None for none.
+        delay: dead time of the inputs, ``(M,)``, s; None for no dead time.
         draws: models of the same class with other constants: copy k is draw ``k % len(draws)``.
             None for copies of the model.
         threads: number of threads that share the copies.
@@ -69,7 +69,7 @@ class ModelPlant(Plant):
         self._copy()
 
     def _copy(self) -> None:
-        """Copy the models with their present numbers and attributes."""
+        """Copy the models with their current numbers and attributes."""
         self._watch = Watch(*self._originals)
         self._models = [model_for_rollouts(x) for x in self._originals]
         self._model = self._models[0]
@@ -83,7 +83,7 @@ class ModelPlant(Plant):
         self._loop = self._ready()
 
     def restart(self, chosen: Tensor, q0: Tensor, v0: Tensor) -> None:
-        """Put the chosen copies ``(K,)`` into new states ``(k, N)``, with inputs of zero before."""
+        """Set new states ``(k, N)`` of the chosen copies ``(K,)``. Inputs before are zero."""
         self._x = self._x.clone()
         self._x[chosen] = self._states(q0, v0, chosen)
         self._inputs = [torch.where(chosen[:, None], 0.0, u) for u in self._inputs]
@@ -104,10 +104,10 @@ class ModelPlant(Plant):
         return self._motion()
 
     def _path(self, duration: float, count: int) -> Tensor:
-        """Return the increments ``(K, 2N)`` after the last inputs."""
+        """Return the increments ``(K, 2N)`` after ``duration`` s under the latest inputs."""
         starts = duration * torch.arange(1 - len(self._inputs), 1, dtype=torch.float64)
         signal = Signal(starts, torch.stack(self._inputs, dim=1), "hold").delayed(self._delay)
-        # Steps of the integration end where a delayed input changes.
+        # Steps of the integration end at the times at which a delayed input changes.
         times = torch.linspace(0.0, duration, count + 1, dtype=torch.float64)
         times = torch.cat([times, signal.t.clamp(0.0, duration)]).unique()
         increments = torch.empty_like(self._x)
@@ -163,7 +163,7 @@ class _Setup:
         robot = load(robot) if isinstance(robot, (str, Path)) else robot
         data = robot if data is None and isinstance(robot, Run) else data
         if data is None:
-            raise TypeError("a robot that is not a run needs training data: set data")
+            raise TypeError("the robot is not a run, so training data are missing: set data")
         source = data.source if isinstance(data, Run) else data
         train = source.load().train
         sample_time = float(train[0].t[1] - train[0].t[0])
@@ -179,43 +179,40 @@ class _Setup:
         elif isinstance(robot, MechanicalSystem):
             robot = SystemPlant(double_copy(robot))
         self.plant: Plant = robot
-        q, v = (
-            [x[:: max(1, len(x) // _SAMPLES)].double() for x in values]
-            for values in ([item.q for item in train], [item.v for item in train])
-        )
+        strides = [max(1, len(item.q) // _SAMPLES) for item in train]
+        q = [item.q[::stride].double() for item, stride in zip(train, strides, strict=True)]
+        v = [item.v[::stride].double() for item, stride in zip(train, strides, strict=True)]
         self.region = DataRegion(q, v, angles=source.angles)
         self.q, self.v, u = torch.cat(q), torch.cat(v), torch.cat([item.u for item in train])
-        ends = [
-            u.amin(0) if limits[0] is None else limits[0],
-            u.amax(0) if limits[1] is None else limits[1],
-        ]
-        low, high = (np.asarray(limit, dtype=np.float32) for limit in ends)
+        low = np.asarray(u.amin(0) if limits[0] is None else limits[0], dtype=np.float32)
+        high = np.asarray(u.amax(0) if limits[1] is None else limits[1], dtype=np.float32)
         self.inputs = gymnasium.spaces.Box(low, high)
 
     def observations(self, has_goal: bool) -> gymnasium.spaces.Box:
-        """Return the space of (q, v), with a goal or without."""
+        """Return the space of observations (q, v), or (q, v, goal)."""
         size = self.q.shape[1] * (3 if has_goal else 2)
         return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
 
 class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    r"""A robot, learned or true, under inputs u ``(M,)`` that are held for a step.
+    r"""A learned or true robot under inputs u ``(M,)`` that are held for a step.
 
-    An episode starts in a state of the training data. The observation is (q, v, goal), ``(3N,)``,
-    with the default reward -\|q - goal\|^2 and a goal from the training data. It is (q, v),
-    ``(2N,)``, with another reward.
+    An episode starts in a state of the training data. With the default reward -\|q - goal\|^2, the
+    goal is drawn from the training data, and the observation is (q, v, goal), ``(3N,)``. With any
+    other reward, the observation is (q, v), ``(2N,)``.
 
-    A motion that diverges ends the episode (``terminated``) in its last finite state, with the
-    reward of that state for all remaining steps, as if the robot stayed there.
+    If the motion diverges, the episode ends (``terminated``) in the last finite state. The reward
+    of this state is given for all remaining steps, as if the robot stayed there.
     ``info["distance"]`` is the distance from the training data
-    (:class:`~pinn_dyn.control.DataRegion`), 1 at the edge. Far beyond, a learned model is wrong.
+    (:class:`~pinn_dyn.control.DataRegion`), 1 at the edge. Far beyond the edge, a learned model is
+    wrong.
 
     Args:
         robot: a run or its folder, a mechanical system, or a plant such as
             :class:`~pinn_dyn.control.SimulatorPlant`. A run is integrated as in its training, a
             mechanical system by an adaptive solver.
-        data: training data of start states, goals and limits, as a data set or a run; None for
-            those of the run.
+        data: training data for start states, goals and limits, as a data set or a run; None for
+            the data of the run.
         reward: reward of a step; None for the distance to a goal.
         step: time between actions, s; None for the step of the training, or of the data.
         duration: length of an episode, s.
@@ -247,7 +244,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode in a drawn state of the training data."""
+        """Start an episode in a random state of the training data."""
         super().reset(seed=seed)
         start, goal = self.np_random.integers(len(self._q), size=2)
         self._goal = self._q[goal].numpy()
@@ -258,7 +255,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold an input ``(M,)``, clipped to its limits, for one step."""
+        """Hold an input ``(M,)``, clipped to its limits, for a step."""
         u = _clipped(action, self.action_space)
         motion = self.plant.advance(torch.from_numpy(u)[None], self.dt)
         state = np.concatenate([x[0].numpy() for x in motion])
@@ -287,26 +284,28 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    r"""K robots that are integrated side by side, with the interface of Gymnasium.
+    r"""Gymnasium vector environment of K robots that are integrated together.
 
-    Each robot is a :class:`RobotEnv`, with the same observations, rewards and ends. Episodes end at
-    different times. A robot starts a new one in the step after its last; at once with
-    ``AutoresetMode.SAME_STEP``, where ``infos["final_obs"]`` holds the last observation; or at the
-    call of ``reset(options={"reset_mask": mask})`` with ``AutoresetMode.DISABLED``. ``distances()``
-    returns the distances from the training data.
+    Each robot has the observations, rewards and ends of episodes of :class:`RobotEnv`. Episodes end
+    at different times. By default, a robot starts a new episode in the step after the last step of
+    an episode. With ``AutoresetMode.SAME_STEP``, the robot starts in the same step, and
+    ``infos["final_obs"]`` holds the last observation. With ``AutoresetMode.DISABLED``, the robot
+    starts at a call of ``reset(options={"reset_mask": mask})``. ``distances()`` returns the
+    distances from the training data.
 
     Args:
         robot: a run or its folder, or a :class:`ModelPlant`.
         num_envs: K.
         data, step, duration, u_low, u_high: see :class:`RobotEnv`.
         reward: rewards of a step for arrays of K robots; None for the distance to a goal.
-        draws: models with other constants, as ``run.sample`` returns them: robot k is draw
-            ``k % len(draws)``. They need a run. None for K copies of the model.
+        draws: models with other constants, such as ``run.sample`` returns: robot k is draw
+            ``k % len(draws)``. Draws need a run. None for K copies of the model.
         threads: number of threads that share the robots of a run.
-        autoreset: when a robot starts again.
+        autoreset: time at which a robot starts a new episode.
 
     Raises:
-        TypeError: on another robot, if ``data`` is missing, or for ``draws`` without a run.
+        TypeError: if the robot has another type, ``data`` is missing, or there are ``draws``
+            without a run.
     """
 
     action_space: gymnasium.spaces.Box
@@ -329,15 +328,14 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     ):
         setup = _Setup(robot, data, step, (u_low, u_high), draws, threads)
         if not isinstance(setup.plant, ModelPlant):
-            raise TypeError("a vector of robots needs a run: use gymnasium.make_vec for others")
+            raise TypeError(
+                "RobotVectorEnv needs a run or a ModelPlant: use gymnasium.make_vec for any other "
+                "robot"
+            )
         if draws is not None and isinstance(robot, ModelPlant):
-            raise TypeError("draws need a run: give them to the ModelPlant")
-        self.num_envs, self.plant, self.dt, self.region = (
-            num_envs,
-            setup.plant,
-            setup.dt,
-            setup.region,
-        )
+            raise TypeError("draws need a run: pass the draws to the ModelPlant")
+        self.num_envs, self.plant = num_envs, setup.plant
+        self.dt, self.region = setup.dt, setup.region
         self.reward, self.steps = reward, max(1, round(duration / self.dt))
         self._starts = setup.q.numpy(), setup.v.numpy()
         self.single_action_space = setup.inputs
@@ -352,9 +350,9 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode of each robot in a drawn state of the training data.
+        """Start an episode of each robot in a random state of the training data.
 
-        With ``options={"reset_mask": mask}``, a mask ``(K,)``, all other robots go on.
+        With ``options={"reset_mask": mask}``, only the robots in the mask ``(K,)`` start.
         """
         super().reset(seed=seed)
         mask = None if options is None else options.get("reset_mask")
@@ -376,7 +374,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Hold inputs ``(K, M)``, clipped to their limits, for one step."""
+        """Hold inputs ``(K, M)``, clipped to their limits, for a step."""
         mode, ended = self.metadata["autoreset_mode"], self._is_over
         if mode == AutoresetMode.DISABLED and ended.any():
             raise gymnasium.error.ResetNeeded(
@@ -430,7 +428,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
 
 
 def _clipped(action: np.ndarray, space: gymnasium.spaces.Box) -> np.ndarray:
-    """Return an action within the limits of its space; refuse another shape."""
+    """Return an action clipped to the limits of its space. Raise an error for a wrong shape."""
     if np.shape(action) != space.shape:
         raise ValueError(f"the action has the shape {np.shape(action)}, expected {space.shape}")
     return np.minimum(np.maximum(action, space.low), space.high).astype(float)

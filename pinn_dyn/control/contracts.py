@@ -162,9 +162,8 @@ class Wrapper(Stage):
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor | None:
         memory = self.law.start(q, v, u)
-        if memory is None:
-            return None
-        return torch.cat([q.new_zeros(*q.shape[:-1], self.own_size), memory], dim=-1)
+        zeros = q.new_zeros(*q.shape[:-1], self.own_size)
+        return None if memory is None else torch.cat([zeros, memory], dim=-1)
 
 
 class Plant(abc.ABC):

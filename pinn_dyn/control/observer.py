@@ -125,9 +125,7 @@ class MomentumObserver:
         state = torch.cat([q, momentum], dim=-1)
         no_input = q.new_zeros(*q.shape[:-1], self.model.num_inputs)
         force = self.model.momentum_derivative(state, no_input)[..., q.shape[-1] :]
-        if self.rest is not None:
-            force = force + self.model.friction_force(v)
-        return momentum, force
+        return momentum, force if self.rest is None else force + self.model.friction_force(v)
 
     def driven(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force that the input adds, ``(*batch, N)``."""

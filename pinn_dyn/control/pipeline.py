@@ -93,7 +93,7 @@ class Pipeline(nn.Module):
         has_delay = bool(times.any())
         if period is None and (law.needs_period or has_delay or self.actuator.rate is not None):
             raise ValueError(
-                f"{type(law).__name__} with its limits and dead time needs a fixed period: set a "
+                f"{type(law).__name__} with its limits and dead time needs a fixed period: give a "
                 "rate"
             )
         self.period = float("nan") if period is None else float(period)

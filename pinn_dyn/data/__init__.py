@@ -1,4 +1,4 @@
-"""Data: excitation signals, simulated data sets, logs, windows and the LightningDataModule."""
+"""Data sets: excitation signals, simulations, logs, windows and the LightningDataModule."""
 
 from typing import TYPE_CHECKING
 

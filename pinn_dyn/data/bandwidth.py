@@ -1,4 +1,4 @@
-"""Bandwidth of sampled signals, and the step that follows them."""
+"""Bandwidth of sampled signals, and a step that resolves them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ _COARSER = 2.5  # round time over a tenth of the period, at most
 
 
 def bandwidth(signals: Sequence[np.ndarray], step: float, noise: np.ndarray) -> float:
-    """Return the frequency in Hz below which 99 % of the power of the rates of signals is.
+    """Return the frequency (Hz) below which 99 % of the power of the signals' derivatives lies.
 
     Args:
         signals: signals of each run, ``(T, K)``.
         step: sample time, s.
-        noise: standard deviation of their noise, ``(K,)``, which does not count.
+        noise: standard deviation of the noise of each signal, ``(K,)``. The power of the noise is
+            subtracted.
     """
     size = min(max(round(8 / step), _SEGMENT), min(map(len, signals)))
     spectra = [scipy.signal.welch(x, 1 / step, nperseg=size, axis=0) for x in signals]
@@ -42,17 +43,18 @@ def bandwidth(signals: Sequence[np.ndarray], step: float, noise: np.ndarray) -> 
 
 
 def hold_of(signals: Sequence[np.ndarray]) -> int:
-    """Return the median number of samples over which signals ``(T, K)`` keep their values."""
+    """Return the median number of samples for which signals ``(T, K)`` hold their values."""
     changes = [np.flatnonzero((np.diff(x, axis=0) != 0).any(axis=1)) for x in signals]
     lengths = np.concatenate([np.diff(x) for x in changes])
     return int(np.median(lengths)) if len(lengths) else 1
 
 
 def samples_in_step(signals: Sequence[list[np.ndarray]], step: float) -> int:
-    """Return the samples in about a tenth of a period of the slower kind of signal, a round time.
+    """Return the number of samples in about a tenth of a period of the motion.
 
-    Measured coordinates have noise and inputs may jump, so the slower of both tells how fast the
-    motion is. Of signals that are held between their samples, one sample per hold counts.
+    The period is that of the slower kind of signal, inputs or coordinates, since measured
+    coordinates have noise, and inputs may jump. The time is round if possible. For signals that
+    are held over several samples, only one sample per hold counts.
 
     Args:
         signals: inputs and coordinates of each run, ``(T, K)``.
@@ -61,9 +63,9 @@ def samples_in_step(signals: Sequence[list[np.ndarray]], step: float) -> int:
     fastest = []
     for kind in signals:
         hold = hold_of(kind)
-        kept = [x[::hold] for x in kind]
-        fastest.append(bandwidth(kept, hold * step, np.zeros(kept[0].shape[1])))
-    # White signals have no bandwidth above their noise.
+        updates = [x[::hold] for x in kind]
+        fastest.append(bandwidth(updates, hold * step, np.zeros(updates[0].shape[1])))
+    # The bandwidth of white signals is zero.
     longest = 0.1 / max(min([x for x in fastest if x > 0], default=0.5 / step), _SLOWEST)
     usual = [x for x in _ROUND if 0.99 <= x / longest <= _COARSER]
     fitting = [x for x in usual if abs(x / step % 1 - 0.5) > 0.49]
@@ -74,7 +76,7 @@ _SAMPLES = 8  # smallest number of steps in a period
 
 
 def periods(trajectories: Sequence[Trajectory]) -> Tensor:
-    """Return the period at the median of the power of v, ``(N,)``, s; infinite without motion."""
+    """Return the period at the median of the power of v, ``(N,)``, s; infinity without motion."""
     frequencies, powers = [], []
     for item in trajectories[:: -(-len(trajectories) // 30)]:
         v, sample = item.v.double(), float(item.t[1] - item.t[0])
@@ -90,12 +92,12 @@ def periods(trajectories: Sequence[Trajectory]) -> Tensor:
 def too_long_for(
     trajectories: Sequence[Trajectory], step: float, labels: Sequence[str]
 ) -> str | None:
-    """Return a message if a step in s is too long for the fastest labeled coordinate, else None."""
+    """Return a message if a step in s is too long for the fastest coordinate, otherwise None."""
     period, k = periods(trajectories).min(0)
     if not period < _SAMPLES * step:
         return None
     return (
         f"a step of {step:g} s is too long for the fastest motion in the data, that of "
         f"{labels[int(k)]}, which has a period of about {period:.2g} s: expected at least "
-        f"{_SAMPLES} steps in it, of {period / _SAMPLES:.2g} s or less"
+        f"{_SAMPLES} steps per period, of {period / _SAMPLES:.2g} s or less"
     )

@@ -1,4 +1,4 @@
-"""Disk cache for arrays that take long to make."""
+"""Disk cache for arrays that take long to compute."""
 
 from __future__ import annotations
 
@@ -40,16 +40,18 @@ def load_or_make(
 ) -> Arrays:
     """Load the arrays of a description from the cache, or make and store them.
 
-    A file is ``<name>-<key>.npz``, without pickle. A reader never sees half a file. One process
-    makes it while others wait. A damaged file is made again. A read-only folder is only read.
+    The file ``<name>-<key>.npz`` has no pickled objects. Readers never see an incomplete file. A
+    single process makes the file while others wait. A damaged file is made again. A read-only
+    folder is only read.
 
     Args:
-        folder: the cache folder, made if missing.
+        folder: the cache folder, created if missing.
         name: first part of the file name.
-        description: everything that the arrays depend on, JSON-serializable.
+        description: all values that determine the arrays, JSON-serializable.
         make: function that makes the arrays.
-        prove: function that computes some numbers for stored arrays, by the code that made them.
-            They are stored as ``proof``. Arrays with another proof up to rounding are made again.
+        prove: function that computes numbers from stored arrays with the current code. The numbers
+            are stored as ``proof``. If a proof differs by more than rounding, the arrays are made
+            again.
     """
 
     def proven() -> Arrays:
@@ -80,7 +82,7 @@ def load_or_make(
 
 
 def _holds(arrays: Arrays, prove: Callable[[Arrays], np.ndarray] | None, path: Path) -> bool:
-    """Return true if the proof of stored arrays is the present one; else say that it is not."""
+    """Return true if stored arrays have the current proof; log a warning if they do not."""
     if prove is None:
         return True
     stored, present = arrays["proof"], prove(arrays)
@@ -89,7 +91,7 @@ def _holds(arrays: Arrays, prove: Callable[[Arrays], np.ndarray] | None, path: P
         if np.allclose(present, stored, rtol=_ROUNDING, atol=scale, equal_nan=True):
             return True
     log.warning(
-        "the recording %s does not follow the present code of its robot and excitation: "
+        "the recording %s differs from the current code of its robot and excitation: "
         "it is made again",
         path,
     )
@@ -108,17 +110,17 @@ _MODULE_ATTRIBUTES = frozenset(vars(torch.nn.Module()))
 def describe(value: object) -> Any:
     """Describe a value as JSON: an object by its class and its ``describe()`` or its attributes.
 
-    A class or a function is identified by its name: a recording shows by its samples whether the
-    present code has made it (:func:`~pinn_dyn.data.cache.load_or_make`).
+    A class or a function is described only by its name. Changes of its code are detected by the
+    proof of a recording (:func:`~pinn_dyn.data.cache.load_or_make`).
 
     Raises:
-        TypeError: on an object that cannot be pickled; give its class a method ``describe()``.
+        TypeError: if an object cannot be pickled; give its class a method ``describe()``.
     """
     return plain(value, _described_object)
 
 
 def plain(value: object, describe_object: Callable[[Any], Any]) -> Any:
-    """Convert tensors, mappings and sequences to JSON, and other objects by a function."""
+    """Convert tensors, mappings and sequences to JSON, and all other objects by a function."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, (torch.Tensor, np.ndarray, np.generic)):

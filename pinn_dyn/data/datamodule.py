@@ -22,24 +22,24 @@ log = logging.getLogger(__name__)
 
 
 class DynamicsData:
-    """Training pairs from a data source, drawn from its training trajectories alone.
+    """Training windows from the training trajectories of a data source.
 
     Args:
         source: the source of the trajectories.
-        pairs: number of training windows, or ``"all"`` windows of the trajectories, which are also
-            used if there are fewer. ``"auto"`` is as many as cover the trajectories once, from 150
-            to 600, at equal distances.
+        pairs: number of training windows, or ``"all"`` windows of the trajectories. All windows are
+            also used if there are fewer than the number. ``"auto"`` covers the trajectories once,
+            with 150 to 600 windows at equal distances.
         steps: steps H of a window; 1 gives the paper's transition pairs. ``"auto"`` is 40, or half
             of the longest trajectory if that is shorter.
-        stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``, or
-            ``"about 20 ms"``, which is rounded to whole samples. ``"auto"`` is about a tenth of a
-            period of the fastest input, or of the fastest motion if that is slower, without noise
-            and holds of the inputs.
+        stride: samples of the data in a step, or the length of a step as a time, such as
+            ``"20 ms"`` or, rounded to whole samples, ``"about 20 ms"``. ``"auto"`` is about a tenth
+            of a period of the fastest input, or of the fastest motion if it is slower. Noise and
+            holds of the inputs are ignored.
         batch_size: windows in a batch.
         batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.
         coverage: evenness of the windows over the configurations, see :func:`draw_windows`.
-        history: time before a window over which q and u are kept, for models of a delay or with a
+        history: time before a window for which q and u are stored, for models with a delay or a
             memory, s.
     """
 
@@ -67,7 +67,7 @@ class DynamicsData:
 
     @property
     def step(self) -> float:
-        """Step of a window, s."""
+        """Length of a step of a window, s."""
         t = self.splits.train[0].t
         return self._samples * float(t[1] - t[0])
 
@@ -100,7 +100,7 @@ class DynamicsData:
         """Training windows.
 
         Raises:
-            ValueError: on a batch larger than the number of windows.
+            ValueError: if a batch is larger than the number of windows.
         """
         runs, stride, steps = self.splits.train, self._samples, self._window_steps
         starts = sum(max(len(x.t) - steps * stride, 0) for x in runs)

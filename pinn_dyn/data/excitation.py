@@ -1,4 +1,4 @@
-"""Excitation signals: random inputs that move a robot while data are taken."""
+"""Excitation signals: random inputs that move a robot during data collection."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ Bounds = Annotated[
 """A range [low, high] with 0 < low <= high."""
 
 InputSignal = Callable[[np.ndarray], np.ndarray]
-"""Maps times ``(T,)`` in s to inputs ``(count, T, M)``: ``count`` signals drawn together."""
+"""Function from times ``(T,)`` in s to inputs ``(count, T, M)`` of ``count`` drawn signals."""
 
 
 def picked_signals(
     signals: Sequence[InputSignal], which: np.ndarray, row: np.ndarray
 ) -> InputSignal:
-    """Join signals of several draws: signal k is number ``row[k]`` of ``signals[which[k]]``."""
+    """Select signals from several draws: signal k is number ``row[k]`` of ``signals[which[k]]``."""
 
     def signal(t: np.ndarray) -> np.ndarray:
         values = [part(t) for part in signals]
@@ -40,7 +40,7 @@ def picked_signals(
 
 
 class Excitation(abc.ABC):
-    """A family of random input signals, drawn with a seed.
+    """A family of random input signals.
 
     A signal moves about ``offset`` with a peak drawn uniformly from ``[amplitude/3, amplitude]``.
     """
@@ -56,7 +56,7 @@ class _Bounded(Excitation):
     amplitude: Sequence[NonNegativeFloat]
 
     def _scaled(self, shape: np.ndarray, peak: np.ndarray) -> np.ndarray:
-        """Return offset + peak * shape, for a shape ``(count, T, M)`` within [-1, 1]."""
+        """Return offset + peak * shape for a shape ``(count, T, M)`` within [-1, 1]."""
         return np.asarray(self.offset) + peak[:, None, :] * shape
 
     def _peaks(self, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -78,7 +78,7 @@ class MultiSine(_Bounded):
     harmonics: PositiveInt = 4
 
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> InputSignal:
-        """Draw ``count`` multi-sines; they do not depend on the duration."""
+        """Draw ``count`` multi-sines, which do not depend on the duration."""
         peak = self._peaks(count, rng)
         shape = (*peak.shape, self.harmonics)
         low, high = np.log(self.frequency)
@@ -127,7 +127,7 @@ class Steps(_Bounded):
     Args:
         offset: mean of each input, ``(M,)``.
         amplitude: largest peak of each input, ``(M,)``.
-        hold: [low, high] in s of the time that a level lasts, ramp included.
+        hold: [low, high] in s of the duration of a level, including its ramp.
         rise_time: length of a ramp in s, at most ``hold[0]``.
     """
 
@@ -149,7 +149,7 @@ class Steps(_Bounded):
         rows, _, columns = np.ix_(range(count), range(1), range(peak.shape[1]))
 
         def signal(t: np.ndarray) -> np.ndarray:
-            # A ramp ends before the next begins: only the last ramp begun is under way.
+            # A ramp ends before the next ramp begins, so at most the latest ramp is active.
             begun = (t[:, None, None] >= start[:, None, :, :-1]).sum(-1)
             last = np.maximum(begun - 1, 0)
             before = level[rows, columns, last]
@@ -162,12 +162,12 @@ class Steps(_Bounded):
 
 @dataclass(frozen=True)
 class Mixture(Excitation):
-    """Signals of several kinds in turn: signal k is drawn from ``parts[k % len(parts)]``."""
+    """Signals of several kinds: signal k is drawn from ``parts[k % len(parts)]``."""
 
     parts: Annotated[Sequence[Excitation], Field(min_length=1)]
 
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> InputSignal:
-        """Draw ``count`` signals, shared out among the parts in turn."""
+        """Draw ``count`` signals from the parts in turn."""
         kinds, index = len(self.parts), np.arange(count)
         signals = [
             part.draw(len(index[k::kinds]), duration, rng) for k, part in enumerate(self.parts)

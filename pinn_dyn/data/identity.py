@@ -1,4 +1,4 @@
-"""Identity of a data set: hashes and moments of its trajectories, and what changed in them."""
+"""Identity of a data set: hashes and moments of its trajectories, and a list of changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ROUNDING = 1e-6
 
 
 def data_identity(source: DataSource) -> dict[str, dict[str, Any]]:
-    """Return the ``names``, ``lengths``, ``hashes`` and ``moments`` of the trajectories by split.
+    """Return ``names``, ``lengths``, ``hashes`` and ``moments`` of the trajectories of each split.
 
     The moments ``(K, 2, 2N + M + 1)`` are the mean and standard deviation of q, v, u and t.
     """
@@ -42,7 +42,7 @@ def _hash(item: Trajectory) -> str:
 
 
 def data_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """List the differences between two identities beyond rounding, a sentence each."""
+    """Return a sentence for each difference of two identities beyond rounding."""
     earlier, present = _by_name(before), _by_name(now)
     changes = [f"{name} is no longer in {earlier[name][0]}" for name in earlier.keys() - present]
     changes += [f"{name} is new in {present[name][0]}" for name in present.keys() - earlier]

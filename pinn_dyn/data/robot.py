@@ -1,4 +1,4 @@
-"""Recordings of a torque-controlled robot in a simulator that steps by itself."""
+"""Recordings of a torque-controlled robot in a physics simulator."""
 
 from __future__ import annotations
 
@@ -27,30 +27,32 @@ _DRAWS = 20
 class RobotSource(RecordedSource):
     """Trajectories of a robot under motor torques, recorded once and cached on disk.
 
-    Samples are q, v and the motor torque u, clipped to the robot's limits and without the joints'
-    friction. The simulator steps semi-implicitly, v_k+1 = v_k + h a_k and q_k+1 = q_k + h v_k+1:
-    the velocity that it reports with q_k belongs to half a step earlier (leapfrog; Hairer, Lubich,
-    Wanner 2006, section I.3.1). Samples hold v(t_k) = (v_k + v_k+1) / 2, of second order in h.
+    Samples are q, v and the motor torque u, clipped to the robot's limits and before the friction
+    of the joints. The simulator takes semi-implicit steps, v_k+1 = v_k + h a_k and
+    q_k+1 = q_k + h v_k+1. The velocity that the simulator reports with q_k belongs to the time half
+    a step earlier (leapfrog; Hairer, Lubich, Wanner 2006, section I.3.1). Samples therefore hold
+    v(t_k) = (v_k + v_k+1) / 2, which is of second order in h.
 
-    A trajectory that reaches a position or velocity limit is drawn anew.
+    A trajectory that reaches a position or velocity limit is drawn again.
 
     Args:
         name: short name of the data set.
         system: the robot.
-        excitations: kinds of motion, which the trajectories of a split take in turn.
+        excitations: kinds of motion. The trajectories of a split use them in turn.
         duration: length of each trajectory, s.
         step: time step of the simulator and sample time, s.
         train, validation, test: number of trajectories.
         seed: seed of all motions.
         cache: folder of the cache; ``~`` is the home folder.
-        configurations: named configurations at which learned terms are looked at, ``(N,)`` each;
-            None takes the middle of the joint ranges.
+        configurations: named configurations at which learned terms are evaluated, ``(N,)`` each;
+            None for the middle of the joint ranges.
 
     Attributes:
-        may_simulate: false for a run folder of others, whose robot no simulator loads.
+        may_simulate: false for an untrusted run folder, whose robot must not be loaded by a
+            simulator.
 
     Raises:
-        ValueError: on a joint without limits.
+        ValueError: if a joint has no limits.
     """
 
     system: SimulatedArm
@@ -90,12 +92,12 @@ class RobotSource(RecordedSource):
         return {split: getattr(self, split) for split in SPLITS}
 
     def simulate(self) -> Arrays:
-        """Record all motions anew, with a sample more than a trajectory has.
+        """Record all motions again, with an additional sample per trajectory.
 
         Raises:
             SimulationError: if no draw of a trajectory stays within the limits.
-            ValueError: from an excitation that the robot cannot follow, or if the robot of a run
-                folder would have to be simulated.
+            ValueError: if the robot cannot follow an excitation, or comes from an untrusted run
+                folder.
         """
         if not self.may_simulate:
             system = f"pinn_dyn.systems.{type(self.system).__name__}"
@@ -105,7 +107,7 @@ class RobotSource(RecordedSource):
             )
         t = np.arange(round(self.duration / self.step) + 2) * self.step
         tasks = [(i, k) for i, count in enumerate(self.counts.values()) for k in range(count)]
-        # One generator per trajectory: more trajectories do not change the others.
+        # A generator per trajectory, so that more trajectories do not change existing ones.
         rngs = [np.random.default_rng([self.seed, *task]) for task in tasks]
         kinds = np.array([k for _, k in tasks]) % len(self.excitations)
         motions = np.full((3, len(tasks), len(t), self.system.num_coordinates), np.nan)
@@ -133,14 +135,13 @@ class RobotSource(RecordedSource):
             self.system.set_state(q, v)
             numbers += self.system.step(u, self.step)
         for k, excitation in enumerate(self.excitations):
-            plan = excitation.draw(
-                self.system, arrays["t"], [np.random.default_rng([self.seed, k])]
-            )
+            rng = np.random.default_rng([self.seed, k])
+            plan = excitation.draw(self.system, arrays["t"], [rng])
             numbers += [plan.q0, plan.v0, plan.torque(0, plan.q0, plan.v0)]
         return np.concatenate([np.ravel(x) for x in numbers])
 
     def _record(self, plan: DrawnMotion, t: np.ndarray) -> np.ndarray:
-        """Record q, v and u of K motions that advance step by step together, ``(3, K, T, N)``."""
+        """Record q, v and u of K motions, all step by step at once, ``(3, K, T, N)``."""
         arm = self.system
         q, v, u = motions = np.empty((3, len(plan.q0), len(t), arm.num_coordinates))
         q[:, 0], v[:, 0] = plan.q0, plan.v0

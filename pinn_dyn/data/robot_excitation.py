@@ -30,7 +30,7 @@ class DrawnMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class RobotExcitation(abc.ABC):
-    """A family of random motions of a robot; a dataclass, as its fields are part of a cache key."""
+    """A family of random motions of a robot. Its fields are a part of the cache key."""
 
     @abc.abstractmethod
     def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> DrawnMotion:
@@ -44,8 +44,9 @@ class TrackedMultiSine(RobotExcitation):
         r_i(t) = centre_i + amplitude_i sum_h w_ih sin(2 pi f_ih t + phi_ih),   sum_h w_ih = 1
         u = M(q) (d2r/dt2 + 2 w (dr/dt - v) + w^2 (r - q)) + C v + G + D v,   w = bandwidth
 
-    The robot starts on the reference. A joint's frequencies are lowered until its peak speed is
-    within ``speed``, and all frequencies until the torque along the reference is within ``torque``.
+    The robot starts on the reference. The frequencies of a joint are reduced until its peak speed
+    is within ``speed``. Then all frequencies are reduced until the torque along the reference is
+    within ``torque``.
 
     Source: sums of sines: Swevers et al. 1997 (IEEE Trans. Robotics and Automation 13(5)); computed
     torque: Murray, Li, Sastry 1994, eq. (4.51).
@@ -57,10 +58,10 @@ class TrackedMultiSine(RobotExcitation):
         amplitude: [low, high] of each joint's amplitude, as a fraction of the reach.
         speed: fraction of the velocity limits.
         torque: fraction of the torque limits.
-        bandwidth: of the controller, rad/s.
+        bandwidth: bandwidth of the controller, rad/s.
 
     Raises:
-        ValueError: from :meth:`draw` if holding the arm up takes more than the torque allowed.
+        ValueError: by :meth:`draw`, if the torque against gravity exceeds the allowed torque.
     """
 
     frequency: Bounds
@@ -87,7 +88,7 @@ class TrackedMultiSine(RobotExcitation):
     def _draw_sines(
         self, robot: SimulatedArm, duration: float, rng: np.random.Generator
     ) -> tuple[np.ndarray, ...]:
-        """Draw the arguments of :func:`_reference` for a motion within the limits."""
+        """Draw arguments of :func:`_reference` that keep the motion within the limits."""
         size = robot.num_coordinates
         half = self.reach * (robot.q_high - robot.q_low) / 2
         smallest, largest = self.amplitude
@@ -101,7 +102,7 @@ class TrackedMultiSine(RobotExcitation):
         weight = amplitude[:, None] * rng.dirichlet(np.ones(self.harmonics), size)
         grid = np.arange(0.0, duration, _CHECK_STEP)[:, None, None]
         peak = np.abs(_reference(grid, centre, weight, rate, phase)[1]).max(0)
-        # Slower sines run through a part of the same shape, so the peak falls with the frequency.
+        # Slower sines cover a part of the same shape. The peak speed falls with the frequency.
         rate *= np.minimum(1.0, self.speed * robot.v_max / peak)[:, None]
         for _ in range(20):
             u = robot.motor_torque(*_reference(grid, centre, weight, rate, phase))
@@ -128,20 +129,20 @@ def _reference(
 
 @dataclass(frozen=True)
 class TorqueMultiSine(RobotExcitation):
-    """Multi-sine torques on an arm that gravity does not pull and springs keep in its range::
+    """Multi-sine torques on an arm with gravity compensation and springs to its center::
 
         u_i = G_i(q) + k_i (centre_i - q_i) - c_i v_i + s_i(t)
 
-    s_i is a multi-sine with a peak of up to ``amplitude`` of the torque limit, which would move the
-    spring k_i by ``reach`` of the way from the centre to the nearer limit; c_i damps it critically
-    for M_ii(centre). The centre is drawn from the middle half of the range. The robot starts at
-    rest where spring and torque balance.
+    s_i is a multi-sine with a peak of up to ``amplitude`` times the torque limit. At this peak, the
+    static displacement of the spring k_i is ``reach`` times the distance from the center to the
+    nearer limit. c_i is the critical damping for M_ii(centre). The center is drawn from the middle
+    half of the range. The robot starts at rest in the equilibrium of spring and torque.
 
     Args:
         frequency: [low, high] of the sines in Hz, uniform in the logarithm.
         harmonics: number of sines.
         amplitude: peak of the multi-sines, as a fraction of the torque limits.
-        reach: static displacement, as a fraction of the way to the nearer limit.
+        reach: static displacement, as a fraction of the distance to the nearer limit.
     """
 
     frequency: Bounds
@@ -150,7 +151,7 @@ class TorqueMultiSine(RobotExcitation):
     harmonics: PositiveInt = 4
 
     def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> DrawnMotion:
-        """Draw torque signals and centres."""
+        """Draw torque signals and centers."""
         half = (robot.q_high - robot.q_low) / 2
         peak = self.amplitude * robot.u_max
         sines = MultiSine([0.0] * len(peak), peak.tolist(), self.frequency, self.harmonics)

@@ -39,7 +39,7 @@ class RecordedSource(DataSource):
 
     Args:
         name: short name of the data set.
-        system: the truth.
+        system: the simulated system, the ground truth.
         duration: length of each training trajectory, s.
         step: sample time of the simulation, s.
         validation, test: number of trajectories.
@@ -58,24 +58,24 @@ class RecordedSource(DataSource):
 
     @abc.abstractmethod
     def describe(self) -> dict[str, object]:
-        """Return the settings that the recordings depend on: the key of the cache."""
+        """Return the settings that determine the recordings, for the key of the cache."""
 
     @abc.abstractmethod
     def simulate(self) -> Arrays:
-        """Record all motions anew: arrays ``t`` and ``<split>_<q, v, u>``, each ``(K, T, .)``."""
+        """Record all motions: arrays ``t`` and ``<split>_<q, v, u>``, each ``(K, T, .)``."""
 
     @abc.abstractmethod
     def prove(self, arrays: Arrays) -> np.ndarray:
-        """Return numbers that the present robot and excitation give for a recording, ``(n,)``.
+        """Return numbers that the current robot and excitation give for a recording, ``(n,)``.
 
-        They are the motion of the robot at some recorded samples, and the first drawn motions.
+        These are the motion of the robot at some recorded samples, and the first drawn motions.
         """
 
     @abc.abstractmethod
     def _samples(
         self, t: Tensor, q: Tensor, v: Tensor, u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the samples t, q, v and u of recorded motions."""
+        """Return the samples t, q, v and u of trajectories from those of recorded motions."""
 
     def load(self) -> Splits:
         folder = Path(self.cache).expanduser()
@@ -100,16 +100,17 @@ class RecordedSource(DataSource):
         draws: int,
         message: str,
     ) -> None:
-        """Replace motions that leave the limits by new draws that stay within them.
+        """Replace motions that leave the limits by new draws within the limits.
 
         Args:
             motions: all motions, changed in place.
-            rows: numbers of the motions to look at.
-            record: function from numbers of motions to one or more draws of each, draw after draw.
+            rows: numbers of the motions to check.
+            record: function from numbers of motions to new motions: one or more draws of each,
+                ordered by draw.
             inside: function from q and v ``(K, T, N)`` to a mask ``(K, N)`` of coordinates that
                 stay within their limits.
             draws: largest number of draws of a motion.
-            message: description with places for the names of coordinates and the number of draws.
+            message: format of the error, with fields for names of coordinates and number of draws.
         """
         q, v, _ = motions
         left, drawn = rows[~inside(q[rows], v[rows]).all(-1)], 0
@@ -131,7 +132,7 @@ class RecordedSource(DataSource):
 
 
 def split_recordings(t: np.ndarray, motions: Motions, counts: Mapping[str, int]) -> Arrays:
-    """Return the arrays ``t`` and ``<split>_<q, v, u>`` of motions that lie split after split."""
+    """Return the arrays ``t`` and ``<split>_<q, v, u>`` of motions that are ordered by split."""
     arrays, ends = {"t": t}, np.cumsum([*counts.values()])[:-1]
     for key, values in zip("qvu", motions, strict=True):
         for split, part in zip(counts, np.split(values, ends), strict=True):
@@ -140,7 +141,7 @@ def split_recordings(t: np.ndarray, motions: Motions, counts: Mapping[str, int])
 
 
 def spread_samples(arrays: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, v and u ``(20, .)`` of samples that are spread over all motions."""
+    """Return q, v and u ``(20, .)`` at samples spread over all motions."""
     parts = []
     for key in "qvu":
         motions = [arrays[f"{split}_{key}"] for split in SPLITS]
@@ -152,7 +153,7 @@ def spread_samples(arrays: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class InitialStates:
-    """A box from which initial states are drawn uniformly.
+    """A box for initial states, which are drawn uniformly.
 
     Args:
         q_low, q_high: bounds of the configuration, ``(N,)``.
@@ -178,25 +179,26 @@ class InitialStates:
 class SimulatedSource(RecordedSource):
     """Trajectories of a known system, simulated once and cached on disk.
 
-    Validation and test trajectories have initial states and inputs that no training trajectory
-    has. A motion that leaves ``q_limits`` is drawn anew, both its initial state and its input.
+    Validation and test trajectories share no initial state and no input with training
+    trajectories. For a motion that leaves ``q_limits``, initial state and input are drawn again.
 
     Args:
         name: short name of the data set.
-        system: the truth.
+        system: the simulated system, the ground truth.
         excitation: family of input signals.
         initial_states: box of initial states.
         duration: length of each training trajectory, s.
         test_duration: length of each validation and test trajectory, s; ``duration`` if None.
         step: sample time of the simulation, s.
         dead_time: time after which the recorded input acts on the system, s.
-        delay: dead time that is known, s, one or M; as for a log, the trajectories hold the inputs
-            as they act.
+        delay: known dead time, s, one number or M. As for a log, the trajectories hold the inputs
+            at the times at which they act.
         keep_every: keep every n-th sample, for a lower rate from the same simulation.
         train_initial_states: number of initial states for training.
         train_inputs: number of inputs for training.
-        pairing: ``"product"`` of these, or ``"matched"``: each initial state has its own input.
-        q_limits: limits of q, ``(2, N)``, which no motion leaves; for matched pairs. None: none.
+        pairing: ``"product"`` of initial states and inputs, or ``"matched"``: each initial state
+            has its own input.
+        q_limits: limits of q for all motions, ``(2, N)``, for matched pairs; None for no limits.
         validation, test: number of trajectories.
         seed: seed of all initial states and inputs.
         rtol, atol: tolerances of the solver.
@@ -204,10 +206,10 @@ class SimulatedSource(RecordedSource):
         cache: folder of the cache; ``~`` is the home folder.
         labels: name and unit of each coordinate, N of them.
         input_labels: name and unit of each input, M of them.
-        configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
+        configurations: named configurations at which learned terms are evaluated, ``(N,)`` each.
 
     Raises:
-        ValueError: on settings that do not match, or ranges of q beyond the system's domain.
+        ValueError: if settings do not match, or q leaves the domain of the system.
     """
 
     excitation: Excitation
@@ -249,7 +251,9 @@ class SimulatedSource(RecordedSource):
             ("input_labels", self.input_labels, self.system.num_inputs),
         ):
             if len(values) != expected:
-                raise ValueError(f"{self.name}: {key} has {len(values)} entries, not {expected}")
+                raise ValueError(
+                    f"{self.name}: {key} has {len(values)} entries, expected {expected}"
+                )
         if isinstance(self.system, HasDomain):
             self.system.check_domain(*np.array(self.q_limits or [states.q_low, states.q_high]))
         self.angles = tuple(getattr(self.system, "angles", ()))
@@ -278,10 +282,11 @@ class SimulatedSource(RecordedSource):
     def simulate(self) -> Arrays:
         if self.test_duration in (None, self.duration):
             return self._simulate(SPLITS, self.duration, 0)
-        # Two batches of one size: the compiled equation of motion serves both.
+        # Two batches of the same size use the same compiled equation of motion.
         size = max(len(self._pairs("train")), self.validation + self.test)
         short = self._simulate(SPLITS[1:], self.test_duration, size)
-        return {**short, **self._simulate(SPLITS[:1], self.duration, size)}  # the longer "t"
+        # The second simulation has the longer "t".
+        return {**short, **self._simulate(SPLITS[:1], self.duration, size)}
 
     def prove(self, arrays: Arrays) -> np.ndarray:
         q, v, u = (torch.from_numpy(x) for x in spread_samples(arrays))
@@ -293,9 +298,9 @@ class SimulatedSource(RecordedSource):
         return np.concatenate([x.ravel() for x in (rates.numpy(), q0, v0, inputs)])
 
     def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
-        """Simulate the trajectories of some splits in one batch, padded with copies to ``size``."""
+        """Simulate the trajectories of some splits in a batch, padded with copies to ``size``."""
         t = np.arange(round(duration / self.step) + 1) * self.step
-        # One generator per split: more test trajectories do not change the training set.
+        # A generator per split, so that more test trajectories do not change the training set.
         rngs = {s: np.random.default_rng([self.seed, SPLITS.index(s)]) for s in splits}
         counts = {split: len(self._pairs(split)) for split in splits}
         rows = np.arange(sum(counts.values()))
@@ -317,7 +322,7 @@ class SimulatedSource(RecordedSource):
         return split_recordings(t, motions, counts)
 
     def _pairs(self, split: str) -> np.ndarray:
-        """Return the numbers of the initial state and the input of each motion, ``(K, 2)``."""
+        """Return the indices of the initial state and the input of each motion, ``(K, 2)``."""
         states, inputs = self.counts[split]
         if split == "train" and self.pairing == "product":
             return np.indices((states, inputs)).reshape(2, -1).T
@@ -326,7 +331,7 @@ class SimulatedSource(RecordedSource):
     def _draw(
         self, rngs: Mapping[str, np.random.Generator]
     ) -> tuple[np.ndarray, np.ndarray, InputSignal]:
-        """Draw initial states ``(K, N)`` and inputs of the motions of some splits."""
+        """Draw the initial states ``(K, N)`` and inputs of all motions of some splits."""
         starts, signals, rows = [], [], []
         for index, (split, rng) in enumerate(rngs.items()):
             states, inputs = self.counts[split]
@@ -340,7 +345,7 @@ class SimulatedSource(RecordedSource):
     def _record(
         self, rngs: Mapping[str, np.random.Generator], t: np.ndarray, rows: np.ndarray, draws: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Simulate some draws of the motions of given numbers, draw after draw."""
+        """Simulate ``draws`` draws of the motions with the numbers ``rows``, ordered by draw."""
         q0, v0, signals = zip(*(self._draw(rngs) for _ in range(draws)), strict=True)
         draw, row = np.repeat(np.arange(draws), len(rows)), np.tile(rows, draws)
         signal = picked_signals(signals, draw, row)

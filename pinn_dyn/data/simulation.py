@@ -30,7 +30,7 @@ class SimulationError(RuntimeError):
 
 
 def momentum(system: MechanicalSystem, q: Tensor, v: Tensor) -> Tensor:
-    """Return p = M(q) v, computed in pieces that fit the processor's cache."""
+    """Return p = M(q) v, computed in pieces that fit into the cache of the processor."""
     size = q.shape[-1]
     pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
     with torch.no_grad():
@@ -53,7 +53,7 @@ def simulate(
     """Solve the equation of motion for K trajectories in one batch.
 
     The solver is SciPy's DOP853 (Hairer, Norsett, Wanner 1993). All trajectories share its steps,
-    whose error is controlled in the root mean square over the batch; the samples come from its
+    with an error control of the root mean square over the batch. The samples are taken from its
     dense output.
 
     Args:
@@ -62,14 +62,15 @@ def simulate(
         t: increasing sample times, ``(T,)``, s.
         rtol, atol: tolerances of the solver.
         compile: compile the equation of motion first, if there is a C++ compiler.
-        q_limits: limits of q, ``(2, N)``; samples of a motion that has left them are NaN.
+        q_limits: limits of q, ``(2, N)``; samples after a motion has left its limits are NaN.
         progress: name of the task in lines of progress; None logs none.
 
     Returns:
         q and v, both ``(K, T, N)``.
 
     Raises:
-        SimulationError: if the solver fails or the motion is not finite; says when.
+        SimulationError: if the solver fails or the motion is not finite. The message names the
+            time.
     """
     x0 = np.concatenate([q0, v0], axis=-1)
     count, size = x0.shape
@@ -110,7 +111,7 @@ def simulate(
     with Progress(progress, float(t[-1] - t[0]), "s") as lines:
         while solver.status == "running" and not left.all():
             solver.step()
-            # The very last step may be short: it ends where the time does.
+            # The last step may be short, since it ends at the last time.
             stuck = solver.status == "running" and solver.step_size < _SMALLEST_STEP * t[-1]
             if stuck or solver.status == "failed":
                 raise give_up(solver.t)
@@ -121,6 +122,6 @@ def simulate(
                 left |= outside(states[:, filled:until]).any(-1)
                 filled = until
             left |= outside(solver.y.reshape(count, size))
-            solver.f[np.repeat(left, size)] = 0.0  # the slope that the next step begins with
+            solver.f[np.repeat(left, size)] = 0.0  # the slope at the start of the next step
             lines.update(float(solver.t - t[0]))
     return states[..., :half], states[..., half:]

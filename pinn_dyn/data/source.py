@@ -1,4 +1,4 @@
-"""The contract of a data set: trajectories, split by whole trajectories."""
+"""The contract of a data set: whole trajectories for training, validation and test."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPLITS = ("train", "validation", "test")
 
 @dataclass(frozen=True)
 class Splits:
-    """Trajectories for training, validation and test; no trajectory is in two of them."""
+    """Trajectories for training, validation and test. No trajectory is in two splits."""
 
     train: list[Trajectory]
     validation: list[Trajectory]
@@ -28,17 +28,17 @@ class Splits:
 
 
 class DataSource(abc.ABC):
-    """Source of trajectories: a simulation, a log, or a class of your own with :meth:`load`.
+    """Source of trajectories: a simulation, a log, or a user-defined class with :meth:`load`.
 
     Attributes:
         name: short name, for tables and titles.
         labels: name and unit of each coordinate, N.
         input_labels: name and unit of each input, M.
-        angles: indices of the coordinates that repeat after a whole turn.
-        system: the truth, or None for measured data.
-        configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
-        delay: time by which the inputs of the robot act late, s, one or M. The trajectories hold
-            the inputs as they act.
+        angles: indices of the coordinates that repeat after a full turn.
+        system: the ground truth, or None for measured data.
+        configurations: named configurations at which learned terms are evaluated, ``(N,)`` each.
+        delay: dead time of the robot's inputs, s, one number or M. The trajectories hold the inputs
+            at the times at which they act.
     """
 
     name: str
@@ -51,29 +51,28 @@ class DataSource(abc.ABC):
 
     @property
     def input_delay(self) -> np.ndarray:
-        """Time between an input of the robot and its action, ``(M,)``, s."""
+        """Dead time of each input, ``(M,)``, s."""
         return np.resize(np.asarray(self.delay, dtype=float), len(self.input_labels))
 
     @abc.abstractmethod
     def load(self) -> Splits:
-        """Return the trajectories; a second call reads them from the cache."""
+        """Return the trajectories. A second call reads them from the cache."""
 
     def names(self) -> dict[str, list[str]]:
-        """Return the names of the trajectories of each split; the default numbers them."""
-        splits = self.load()
-        return {
-            split: [f"{split} trajectory {k}" for k in range(len(getattr(splits, split)))]
-            for split in SPLITS
-        }
+        """Return the names of the trajectories of each split. By default, they are numbered."""
+        names = {}
+        for split, trajectories in vars(self.load()).items():
+            names[split] = [f"{split} trajectory {k}" for k in range(len(trajectories))]
+        return names
 
 
 @dataclass(eq=False)
 class StoredSource(DataSource):
-    """Trajectories that :func:`store` wrote to a file, without momenta and true system.
+    """Trajectories from a file of :func:`store`, without momenta and ground truth.
 
     Args:
         path: the file.
-        name, labels, input_labels, angles, delay: as in the stored source.
+        name, labels, input_labels, angles, delay: attributes of the stored source.
 
     Raises:
         ValueError: if the file is missing or damaged, when it is read.
@@ -92,7 +91,7 @@ class StoredSource(DataSource):
         def unpack(t: Any, q: Any, v: Any, u: Any, interpolation: Any, **past: Any) -> Trajectory:
             return Trajectory(q, v, Signal(t, u, interpolation), **past)
 
-        return Splits(**{split: [unpack(**item) for item in content[split]] for split in SPLITS})
+        return Splits(*([unpack(**item) for item in content[split]] for split in SPLITS))
 
     def names(self) -> dict[str, list[str]]:
         names: dict[str, list[str]] = self._read()["names"]
@@ -102,7 +101,7 @@ class StoredSource(DataSource):
         path = Path(self.path).expanduser()
         try:
             if path.exists() and not path.is_file():  # opening a pipe would wait
-                raise ValueError("it is no regular file")
+                raise ValueError("it is not a regular file")
             content: dict[str, Any] = torch.load(path, weights_only=True)
         except Exception as error:  # a damaged file raises nearly anything
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Windows: short pieces of training trajectories, the samples of a network."""
+"""Windows: short pieces of training trajectories, the training samples."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pinn_dyn.mechanics.signal import stacked
 from pinn_dyn.models.statistics import Statistics
 
 _ROWS = ("q", "v", "p", "dq", "dv", "dp", "past_q")
-"""Fields with a row for each window, as the input has."""
+"""Fields with a row per window. The input has a row per window, too."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """B windows of H steps; with H = 1 these are the paper's transition pairs.
+    """B windows of H steps. With H = 1, windows are the paper's transition pairs.
 
-    A step spans ``stride`` samples of the data; the input keeps all its samples.
+    A step spans ``stride`` samples of the data. The input keeps all samples.
 
     Attributes:
         t: times of the steps from the window's start, ``(H + 1,)``, s.
@@ -34,7 +34,7 @@ class Windows:
         dq, dv, dp: increments from the start to each step, ``(B, H, N)``, of double precision.
         input: u, with samples ``(B, past + H * stride + 1, M)``.
         past_q: q at the steps before the start, the latest first, ``(B, past // stride, N)``.
-        past: samples of the input before the start, for models of a delay or with a memory.
+        past: number of samples of the input before the start, for models with a delay or a memory.
     """
 
     t: Tensor
@@ -58,7 +58,7 @@ class Windows:
         return self._map(lambda x: x.index_select(0, rows).view(*shape, *x.shape[1:]))
 
     def unbind(self) -> Iterator[Windows]:
-        """Iterate over the first of several leading dimensions, by views."""
+        """Iterate over the first of several batch dimensions, by views."""
         rows = zip(*(getattr(self, name).unbind() for name in _ROWS), strict=True)
         rate = self.input.rate
         rates = repeat(None) if rate is None else rate.unbind()
@@ -70,7 +70,7 @@ class Windows:
             yield item
 
     def split(self, size: int) -> list[Windows]:
-        """Split the windows into parts of at least ``size`` that differ by at most one window."""
+        """Split the windows into equal parts (up to one window) of at least ``size`` windows."""
         number = len(self) // size
         if number < 2:
             return [self]
@@ -100,7 +100,7 @@ class Windows:
         return torch.cat([self.dq, self.dv if state == "qv" else self.dp], dim=-1)
 
     def first(self, steps: int) -> Windows:
-        """Cut the windows after their first ``steps`` steps."""
+        """Cut the windows after ``steps`` steps."""
         if steps == len(self.t) - 1:
             return self
         stride = (len(self.input.t) - 1 - self.past) // (len(self.t) - 1)
@@ -150,25 +150,25 @@ def draw_windows(
     coverage: float = 0.0,
     history: float = 0.0,
 ) -> Windows:
-    """Draw windows at random starts, or evenly, over all starts of all trajectories.
+    """Draw windows at random or evenly spaced starts from all trajectories.
 
-    With ``coverage`` c = 0 all starts are equally likely. With c > 0 their probabilities are
-    ~ (d_k)^(c N), where d_k is the distance from q ``(N,)`` in units of its spread to its tenth
-    nearest neighbor. As 1/d_k^N estimates the density (Loftsgaarden and Quesenberry 1965), c = 1
-    spreads the windows evenly over the configurations.
+    With ``coverage`` c = 0, all starts are equally likely. With c > 0, their probabilities are
+    ~ (d_k)^(c N), where d_k is the distance of q ``(N,)``, in units of the spread of q, from its
+    tenth nearest neighbor. Since 1/d_k^N estimates the density (Loftsgaarden and Quesenberry 1965),
+    c = 1 spreads the windows evenly over the configurations.
 
     Args:
         trajectories: the training trajectories, each ``(T, N)``, with one sample time.
         count: number of windows B; None for a window at each start.
         steps: steps H of a window.
         stride: samples in a step.
-        seed: seed of the starts; None takes starts at equal distances.
+        seed: seed of the starts; None for evenly spaced starts.
         coverage: c, from 0 to 1.
-        history: time before each start over which q and u are kept, s. Before the earliest sample
+        history: time before each start for which q and u are stored, s. Before the earliest sample,
             they are constant.
 
     Raises:
-        ValueError: on differing sample times, or more windows than starts.
+        ValueError: if sample times differ, or there are more windows than starts.
     """
     span = steps * stride
     sample = float(trajectories[0].t[1] - trajectories[0].t[0])
@@ -195,9 +195,10 @@ def draw_windows(
         parts = [item.q[past:][:n] for item, n in zip(trajectories, starts, strict=True)]
         q = torch.cat(parts)[flat]
         z = (q / q.std(0).clamp(min=1e-12)).numpy()
-        # The nearest neighbor is the row itself.
-        distance = torch.from_numpy(scipy.spatial.cKDTree(z).query(z, k=min(11, len(z)))[0][:, -1])
-        # Rows with the largest log(uniform)/weight: Efraimidis and Spirakis (2006).
+        # The nearest neighbor of a row is the row itself.
+        distances, _ = scipy.spatial.cKDTree(z).query(z, k=min(11, len(z)))
+        distance = torch.from_numpy(distances[:, -1])
+        # Sample with weights: the largest log(uniform)/weight (Efraimidis and Spirakis 2006).
         uniform = torch.rand(len(z), generator=generator, dtype=torch.float64)
         weight = distance.clamp(min=1e-12) ** (coverage * q.shape[-1])
         flat = flat[torch.topk(uniform.log() / weight, count).indices]
@@ -209,7 +210,8 @@ def draw_windows(
 
     knots = torch.arange(steps + 1) * stride
     origins = [(trajectories[i], k) for i, k in zip(number, offset, strict=True)]
-    q, v = (torch.stack([getattr(x, key)[k + knots] for x, k in origins]) for key in "qv")
+    q = torch.stack([x.q[k + knots] for x, k in origins])
+    v = torch.stack([x.v[k + knots] for x, k in origins])
     inputs = [x.input.part(slice(k - past, k + span + 1)) for x, k in origins]
     t = torch.arange(-past, span + 1, dtype=torch.float64) * sample
     momentum = trajectories[0].momentum
@@ -229,7 +231,7 @@ def draw_windows(
 
 
 def _distinct(total: int, count: int, generator: torch.Generator) -> Tensor:
-    # Works also for a total that is too large for a permutation.
+    # The total may be too large for a permutation.
     numbers = torch.unique(torch.randint(total, (count,), generator=generator))
     while numbers.shape[0] < count:
         more = torch.randint(total, (count,), generator=generator)
@@ -238,7 +240,7 @@ def _distinct(total: int, count: int, generator: torch.Generator) -> Tensor:
 
 
 PICKED = 16_384
-"""Approximate number of windows that one operation picks, for many small batches."""
+"""Approximate number of windows that a single operation gathers, for many small batches."""
 
 
 @dataclass(eq=False)
@@ -246,8 +248,8 @@ class WindowLoader:
     """Loader of batches from windows in the memory of a device.
 
     Attributes:
-        windows: all windows, on the device that trains.
-        sampler: positions of each batch, ``(B,)``.
+        windows: all windows, on the training device.
+        sampler: indices of the windows of each batch, ``(B,)``.
     """
 
     windows: Windows
@@ -267,14 +269,14 @@ class WindowLoader:
 
 @dataclass(eq=False)
 class BatchSampler(Sampler[Tensor]):
-    """Batches of an epoch; their order depends on the seed and the epoch alone.
+    """Batches of an epoch. Their order depends only on the seed and the epoch.
 
     Attributes:
         size: number of windows.
         batch_size: windows in a batch.
         batches: batches in an epoch.
         seed: seed of the order.
-        rank, processes: each of several processes yields its own share of every batch.
+        rank, processes: index of this process and number of processes, which share each batch.
     """
 
     size: int
@@ -287,7 +289,7 @@ class BatchSampler(Sampler[Tensor]):
     epoch: int = field(default=0, init=False)
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch; the trainer calls it at the start of each one."""
+        """Set the epoch. The trainer calls this method at the start of each epoch."""
         self.epoch = epoch
 
     def __len__(self) -> int:

@@ -1,1 +1,1 @@
-"""Models, control laws and observers as code for other programs."""
+"""Export models, control laws and observers as code for other programs."""

@@ -1,4 +1,4 @@
-"""C functions of programs: loops over arrays of fixed size on the stack."""
+"""C functions for programs, with loops over arrays of fixed size on the stack."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ Index = Sequence[str]
 
 
 class ConstantArrays:
-    """Arrays that the functions of a C file share, each stored once.
+    """Constant arrays of a C file. Equal arrays are stored once.
 
     Args:
         real: type of the numbers, ``double`` or ``float``.
 
     Attributes:
         block: rows and columns of a matrix product that are summed at once.
-        arguments: names that the functions of the file hand on to each other.
+        arguments: names of arguments that the functions of the file pass to each other.
     """
 
     block = 32, 4
@@ -69,7 +69,7 @@ class ConstantArrays:
         self._arrays: dict[tuple[str, bytes], tuple[str, Tensor]] = {}
 
     def name(self, values: Tensor) -> str:
-        """Return the name of the array with these values."""
+        """Return the name of the array with the given values."""
         values = values.flatten()
         kind = self.real if values.dtype.is_floating_point else "int"
         key = kind, values.numpy().tobytes()
@@ -77,7 +77,7 @@ class ConstantArrays:
 
     def number(self, value: Any) -> str:
         """Return a number as an operand."""
-        if isinstance(value, int):  # and bool
+        if isinstance(value, int):  # int or bool
             return f"{value:d}"
         if math.isnan(value):
             return "NAN"
@@ -86,18 +86,18 @@ class ConstantArrays:
         return f"(-{text})" if value < 0 else text
 
     def elements(self, values: Tensor) -> list[float | str]:
-        """Return the numbers of an array, as expressions where they may be other ones."""
+        """Return the numbers of an array, or expressions for numbers that may change."""
         numbers: list[float | str] = values.tolist()
         return numbers
 
     def common(self, values: Tensor) -> float | None:
-        """Return the whole number that the code may contain for all numbers of an array, if any."""
+        """Return the integer that is equal to all numbers of an array, or None."""
         first = values.flatten()[0]
         is_common = float(first).is_integer() and bool((values == first).all())
         return first.item() if is_common else None
 
     def spread(self, text: str) -> str:
-        """Return an expression as a ``real``, which it may not be if it depends on no input."""
+        """Return an expression as a ``real``. An expression of constants may have another type."""
         return text
 
     def definitions(self) -> list[str]:
@@ -113,7 +113,7 @@ class ConstantArrays:
 
 
 def is_mask_as_number(node: fx.Node, k: int) -> bool:
-    """Return true if operand k is a truth value, and the result of the operation is not."""
+    """Return true if operand k is a boolean and the result of the operation is a number."""
     source = node.args[k]
     return (
         isinstance(source, fx.Node)
@@ -124,7 +124,7 @@ def is_mask_as_number(node: fx.Node, k: int) -> bool:
 
 
 class _Buffers:
-    """Names of arrays on the stack. Arrays whose values are not needed any more are reused."""
+    """Names of arrays on the stack. An array is reused when its values are no longer needed."""
 
     def __init__(self) -> None:
         self.sizes: dict[str, tuple[str, int]] = {}
@@ -150,19 +150,20 @@ def _storage(value: Tensor) -> int:
 
 
 class CFunction:
-    """The body of a C function that evaluates a program.
+    """Body of a C function that evaluates a program.
 
-    An elementwise operation with a single use is written into the loop that uses it. A view costs
-    nothing: it is another index of its array.
+    An elementwise operation with a single use is written into the loop that uses it. A view is only
+    another index of its array.
 
     Args:
         program: the operations.
-        constants: arrays of the file.
+        constants: constant arrays of the file.
 
     Attributes:
         lines: the statements.
-        stack: upper bound of the bytes on the stack, with an optimization of ``-O1`` or more: twice
-            the arrays, since GCC adds up to 1.1 of them at ``-O3``, and 1 kB, also for libm.
+        stack: upper bound of the bytes on the stack, for an optimization of ``-O1`` or more. The
+            bound is twice the size of the arrays, since GCC adds up to 1.1 times their size at
+            ``-O3``, and 1 kB, also for libm.
     """
 
     def __init__(self, program: Program, constants: ConstantArrays):
@@ -207,7 +208,7 @@ class CFunction:
         return same and user.meta["val"].numel() == node.meta["val"].numel()
 
     def _reads(self, node: fx.Node) -> list[int]:
-        """Return the arrays of a node: its result and what its loop reads."""
+        """Return the arrays of a node: its result, and the arrays that its loop reads."""
         value = node.meta["val"]
         pointers = []
         if isinstance(value, Tensor) and node not in self._inlined:
@@ -237,7 +238,7 @@ class CFunction:
         return f"{array}[{' + '.join([*terms, *([str(offset)] if offset else [])]) or 0}]"
 
     def _operand(self, operand: Any, index: Index) -> str:
-        """Return an operand at the index of a result, to which it is broadcast."""
+        """Return an operand, broadcast to the result, at an index of the result."""
         if not isinstance(operand, fx.Node):
             return self.constants.number(operand)
         value = operand.meta["val"]
@@ -263,14 +264,14 @@ class CFunction:
         return ELEMENTWISE[name].format(*operands)
 
     def _number(self, node: fx.Node, k: int, index: Index) -> str:
-        """Return an operand of an elementwise operation, with true as 1 where it is a number."""
+        """Return an operand of an elementwise operation. A boolean in arithmetic becomes 0 or 1."""
         text = self._operand(node.args[k], index)
         return f"choose({text}, 1, 0)" if is_mask_as_number(node, k) else text
 
     # Statements.
 
     def _loops(self, sizes: dict[str, int], body: list[str]) -> None:
-        """Write statements inside loops over indices, the outer first."""
+        """Write statements inside loops over indices, from the outer to the inner loop."""
         loops = [f"for (int {i} = 0; {i} < {n}; {i}++)" for i, n in sizes.items() if n > 1]
         if len(body) > 1:
             loops.append("{")
@@ -280,7 +281,7 @@ class CFunction:
             self.lines.append("  " * (len(loops) - 1) + "}")
 
     def _indices(self, value: Tensor) -> tuple[list[str], dict[str, int]]:
-        """Return an index of each dimension, and the sizes in the order of the memory."""
+        """Return an index for each dimension, and the sizes of indices in the order of memory."""
         index = [f"i{k}" if n > 1 else "0" for k, n in enumerate(value.shape)]
         strides: Any = value.stride()
         order = sorted(range(value.ndim), key=lambda k: -strides[k])
@@ -303,7 +304,7 @@ class CFunction:
     def _write(self, node: fx.Node) -> None:
         value, name = node.meta["val"], operation(node)
         if not isinstance(value, Tensor) or not value.numel() or _storage(value) in self._arrays:
-            return  # of several results, of no numbers, or a view
+            return  # an operation with several results, an empty array, or a view
         if name in ELEMENTWISE:
             index, sizes = self._indices(self._declare(node))
             expression = self._expression(node, index)
@@ -317,10 +318,10 @@ class CFunction:
         write(node, *node.args)
 
     def _mm(self, node: fx.Node, left: fx.Node, right: fx.Node) -> None:
-        """Write a product by blocks of rows and columns, whose sums stay in registers."""
+        """Write a matrix product by blocks of rows and columns, with sums in registers."""
         out, weights = self._declare(node), left
         a, b = left.meta["val"], right.meta["val"]
-        if left.op != "get_attr" and right.op == "get_attr":  # (B^T A^T)^T
+        if left.op != "get_attr" and right.op == "get_attr":  # compute (B^T A^T)^T
             a, b, out, weights = b.mT, a.mT, out.mT, right
         constant, zero = weights.op == "get_attr", self.constants.spread("0")
         (rows, depth), columns = a.shape, b.shape[1]
@@ -352,7 +353,7 @@ class CFunction:
                 self._loops({"b": len(block)}, body)
 
     def _call(self, node: fx.Node, name: str, start: fx.Node, rows: fx.Node, size: int) -> None:
-        """Write x <- name(x, row) for each row, where a single row may change the size of x."""
+        """Write x <- name(x, row) for each row. With a single row, the size of x may change."""
         y, (count, width) = self._declare(node), rows.meta["val"].shape
         x = y if count > 1 else start.meta["val"]
         if count > 1:
@@ -366,7 +367,7 @@ class CFunction:
         start, step = REDUCTIONS[operation(node)]
         start = self.constants.spread(start)
         value, shape = self._declare(node), source.meta["val"].shape
-        if not shape.numel():  # such as the force of no inputs
+        if not shape.numel():  # for example the force without inputs
             self._assign(value, 0.0)
             return
         dims = [d % len(shape) for d in dims] if dims else [*range(len(shape))]
@@ -379,7 +380,7 @@ class CFunction:
             loops = " ".join(f"for (int {i} = 0; {i} < {n}; {i}++)" for i, n in inner.items())
             add = f"{loops} s = {step.format('s', operand)};"
             self._loops(sizes, [f"real s = {start};", add, f"{target} = s;"])
-        else:  # entries side by side do not wait for each other
+        else:  # sums of different entries are independent and run in parallel
             self._loops(sizes, [f"{target} = {start};"])
             self._loops({**inner, **sizes}, [f"{target} = {step.format(target, operand)};"])
 
@@ -392,7 +393,10 @@ class CFunction:
                 start += size
 
     def _move(self, node: fx.Node, source: fx.Node, *arguments: Any) -> None:
-        """Write a loop over a table of the positions of entries, by the operation itself."""
+        """Write a loop over a table of the positions of entries.
+
+        The operation itself gives the positions.
+        """
         if any(x.op != "get_attr" for x in node.all_input_nodes if x is not source):
             raise unsupported(node, "C code")
         x = source.meta["val"]

@@ -1,4 +1,4 @@
-"""C99 files of functions, compiled for a comparison where a C compiler is present."""
+"""C99 files of functions, compared with Python if a C compiler is installed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pinn_dyn.exports.scalar_code import CBody, c_function
 log = logging.getLogger(__name__)
 
 STATUS = "status"
-"""Output that the C function returns, as an int."""
+"""Name of the output that the C function returns as an int."""
 TIME_LIMIT = 60.0
 """Longest time of the comparison of a function, s."""
 _LOOP = """\
@@ -42,7 +42,7 @@ _LOOP = """\
 def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: Real) -> Calls:
     """Write ``NAME.c`` and ``NAME.h`` with a function ``NAME_<function>`` each.
 
-    The functions are reentrant, need libm alone, and allocate nothing. ``NAME_info()`` returns the
+    The functions are reentrant, need only libm, and allocate no memory. ``NAME_info()`` returns the
     text of ``info`` with the SHA-256 of the code.
     """
     name = identifier(path.stem)
@@ -103,9 +103,9 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
 def static_functions(
     parts: Mapping[str, tuple[Program, CBody]], arguments: Sequence[str] = ()
 ) -> list[str]:
-    """Return the lines of functions that other functions of a file call, by name.
+    """Return the lines of static functions, which other functions of the file call.
 
-    ``arguments`` are declarations of further arguments.
+    ``arguments`` are declarations of additional arguments.
     """
     code = []
     for name, (program, body) in parts.items():
@@ -128,13 +128,13 @@ def _signature(function: str, program: Program, name: str, real: Real) -> str:
 
 
 def find_compiler() -> list[str] | None:
-    """Return the command of the C compiler, which CC may set with options, or None without one."""
+    """Return the command of the C compiler, or None. CC may set the command with options."""
     try:
         commands = [shlex.split(name) for name in _compilers()]
     except ValueError as error:
         text = f"CC is {os.environ['CC']!r}, expected the command of a C compiler: {error}"
         raise ValueError(text) from error
-    return next((words for words in commands if shutil.which(words[0])), None)
+    return next((command for command in commands if shutil.which(command[0])), None)
 
 
 def _compilers() -> list[str]:
@@ -142,7 +142,7 @@ def _compilers() -> list[str]:
 
 
 def compile_c(compiler: Sequence[str], flags: Sequence[str], source: Path, code: str = "") -> Path:
-    """Compile a C file to a ``.so`` beside it. With the flag ``-``, add the code to it.
+    """Compile a C file to a ``.so`` beside it. With the flag ``-``, compile ``code`` with it.
 
     Raises:
         RuntimeError: if the compiler fails.
@@ -154,14 +154,17 @@ def compile_c(compiler: Sequence[str], flags: Sequence[str], source: Path, code:
         lines = [*result.stderr.splitlines(), "no message"]
         problem = next((line for line in lines if "error" in line), lines[0])
         name = shlex.join(compiler)
-        raise RuntimeError(f"{name} does not compile {source.name}: {problem}; set CC to another")
+        raise RuntimeError(
+            f"{name} does not compile {source.name}: {problem}; set CC to another compiler"
+        )
     return library
 
 
 def _compiled(path: Path, loops: Sequence[str]) -> Path | None:
-    """Compile a C file to a program that calls it; return None, with a warning, without a compiler.
+    """Compile a C file to a program that calls its functions.
 
-    The program does not run in this process, so an error in the file cannot end it.
+    Without a compiler, log a warning and return None. The program runs in a separate process, so an
+    error in the file cannot end this process.
     """
     compiler = find_compiler()
     if compiler is None:
@@ -182,7 +185,7 @@ def _compiled(path: Path, loops: Sequence[str]) -> Path | None:
 
 
 def _loop(function: str, program: Program, name: str, real: Real) -> str:
-    """Return C code that calls a function for the states of the standard input."""
+    """Return C code that calls a function for all states in the standard input."""
     shapes = program.inputs, program.outputs
     x, y = _pointers("x", shapes[0]), _pointers("y", shapes[1])
     arguments = [pointer if len(shapes[0][key]) else f"*{pointer}" for key, pointer in x.items()]
@@ -198,7 +201,7 @@ def _loop(function: str, program: Program, name: str, real: Real) -> str:
 
 
 def _pointers(array: str, shapes: Mapping[str, torch.Size]) -> dict[str, str]:
-    """Return a pointer to the numbers of each input or output, one after the other in an array."""
+    """Return a pointer to the numbers of each input or output in a common array."""
     starts = accumulate(map(torch.Size.numel, shapes.values()), initial=0)
     return {name: f"&{array}[{start}]" for name, start in zip(shapes, starts, strict=False)}
 

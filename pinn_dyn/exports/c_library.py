@@ -1,4 +1,4 @@
-"""C code that is compiled for this process."""
+"""Compile C code and load it into this process."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 _FLAGS = ["-std=gnu99", "-march=native", "-fno-math-errno", "-fPIC", "-shared"]
 _FLAGS += ["-D__FAST_MATH__"]  # makes glibc declare exp, tanh and so on of vectors, nothing else
 QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
-"""Optimization that takes a third of the time of ``-O3`` for a rigid chain with sticking joints.
-The code has 0.7 to 0.8 of its speed (benchmarks/long_rollout.py)."""
+"""Flags of an optimization with a third of the compilation time of ``-O3``, for a rigid chain with
+sticking joints. The code has 0.7 to 0.8 of the speed (benchmarks/long_rollout.py)."""
 
 _MOST_PROGRAMS = 100  # in the cache folder
 _UNFINISHED = "unfinished-"  # start of the names of folders of running compilations
@@ -34,14 +34,14 @@ _LONGEST = 3600.0  # time of a compilation, s
 
 
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
-    """Compile C code for this processor, unless the cache folder has the library, and load it.
+    """Load C code as a library; compile it for this processor if the cache folder has none.
 
-    Loading a library runs its code. A file of the cache is loaded only if nobody else owns it or
-    may write it, and if its content has the SHA-256 in its name.
-    ``optimization`` is a list of flags of the compiler.
+    Loading a library runs its code. A file in the cache is therefore loaded only if no other user
+    owns it or may write it, and its content has the SHA-256 in its name. ``optimization`` is a list
+    of compiler flags.
 
     Raises:
-        FileNotFoundError: without a C compiler.
+        FileNotFoundError: if no C compiler is installed.
         RuntimeError: if the compiler fails.
     """
     compiler = find_compiler()
@@ -66,7 +66,7 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
 
 
 def _remove_unfinished(folder: Path) -> None:
-    """Delete what killed processes have left of compilations."""
+    """Delete unfinished compilations of killed processes."""
     for path in folder.glob(f"{_UNFINISHED}*"):
         with suppress(OSError):
             if time.time() - path.stat().st_mtime > _LONGEST:
@@ -74,7 +74,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 
 def remember(key: str, content: Any) -> None:
-    """Keep tensors and plain values in the cache folder, for :func:`recall` in later processes."""
+    """Store tensors and plain values in the cache folder, for :func:`recall` in later processes."""
     folder = _folder()
     if not _is_safe(folder):
         return
@@ -83,14 +83,14 @@ def remember(key: str, content: Any) -> None:
         torch.save(content, path)
         path.chmod(0o600)
         earlier = [*folder.glob(f"{key}-*.pt")]
-        others = sorted(folder.glob("*.pt"), key=lambda x: x.stat().st_mtime)
+        oldest = sorted(folder.glob("*.pt"), key=lambda x: x.stat().st_mtime)
         os.replace(path, folder / f"{key}-{_sha256(path)}.pt")
-        for old in {*earlier, *others[:-_MOST_PROGRAMS]}:
+        for old in {*earlier, *oldest[:-_MOST_PROGRAMS]}:
             old.unlink(missing_ok=True)
 
 
 def recall(key: str) -> Any:
-    """Return what :func:`remember` has kept, or None."""
+    """Return the content that :func:`remember` has stored, or None."""
     for path in _unchanged(key, "pt"):
         with suppress(Exception):  # of another version of PyTorch
             os.utime(path)  # the oldest files are deleted
@@ -99,24 +99,27 @@ def recall(key: str) -> Any:
 
 
 def _folder() -> Path:
-    """Return the cache folder, which only this user may write."""
+    """Return the cache folder. Only this user may write to it."""
     folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser() / "compiled"
-    with suppress(OSError):  # a read-only folder: a library serves this process alone
+    with suppress(OSError):  # with a read-only folder, a library is for this process only
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if folder.is_dir() and not _is_safe(folder):
-        log.warning("%s is not used: others own or may write it, run chmod -R go-w there", folder)
+        log.warning(
+            "%s is not used, since other users own it or may write to it: run chmod -R go-w there",
+            folder,
+        )
     return folder
 
 
 def _unchanged(key: str, ending: str) -> list[Path]:
-    """Return the file of a key in the cache folder, if its content has the SHA-256 in its name."""
+    """Return the file of a key in the cache folder whose content has the SHA-256 in its name."""
     folder = _folder()
     paths = folder.glob(f"{key}-*.{ending}") if _is_safe(folder) else []
     return [x for x in paths if _is_safe(x) and x.name == f"{key}-{_sha256(x)}.{ending}"]
 
 
 def _is_safe(path: Path) -> bool:
-    """Return true for a file or folder that this user owns and nobody else may write."""
+    """Return true for a file or folder that this user owns and no other user may write."""
     try:
         status = path.stat()
     except OSError:
@@ -130,6 +133,6 @@ def _sha256(path: Path) -> str:
 
 @cache
 def _target(*compiler: str) -> str:
-    """Return the version of a compiler with flags, and all its flags for this processor."""
+    """Return the version of a compiler, and all its flags for this processor."""
     command = [*compiler, "-###", "-E", "-x", "c", "-"]
     return subprocess.run(command, capture_output=True, text=True, check=True).stderr

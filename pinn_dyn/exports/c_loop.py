@@ -1,4 +1,4 @@
-"""Rollouts as a loop in C. Models that differ only in their numbers share the compiled code."""
+"""Rollouts as a loop in C. Models with different numbers share the compiled code."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from pinn_dyn.mechanics.signal import Signal
 NUMBERS = 2**21
 """Number of inputs that are computed at once, to limit the memory of large batches."""
 SEVERAL_FROM = 4
-"""Number of trajectories from which they are computed side by side in vectors."""
+"""Number of trajectories from which several trajectories are computed at once, in vectors."""
 _STEP = "integration_step"  # name of the function in the code
 
 
 class CLoop(Wrapped):
-    """Integrator that runs paths as a loop in C, in float64 and without gradients.
+    """Integrator that computes paths by a loop in C, in float64 and without gradients.
 
-    The states are those of the inner integrator up to rounding. :class:`~.compiled.Compiled` says
-    when the inner integrator computes a path.
+    The states are those of the inner integrator up to rounding. The inner integrator computes a
+    path if there is no loop in C, see :class:`~.compiled.Compiled`.
 
     Args:
         inner: the method.
@@ -46,9 +46,9 @@ class CLoop(Wrapped):
         self._compiled: Compiled | None = None
 
     def ready(self, dynamics: ContinuousPredictor, x: Tensor, h: float) -> Function | None:
-        """Return the loop for paths from states x ``(B, S)`` with steps of h s, if there is one.
+        """Return the loop for paths from states x ``(B, S)`` with steps of h s, or None.
 
-        It stays the loop of the present numbers of the model.
+        The loop always uses the current numbers of the model.
         """
         u = x.new_zeros(len(x), 1, len(self.nodes), dynamics.num_inputs)
         steps = Steps(dynamics, x, u, x.new_tensor([h]))
@@ -83,7 +83,7 @@ class CLoop(Wrapped):
 
 
 class Loop:
-    """Compiled loop of a model over the steps of one trajectory after another.
+    """Compiled loop of a model over trajectories and their steps.
 
     Args:
         library: the compiled code.
@@ -119,7 +119,7 @@ class Loop:
         size = -(-count // (threads * self._lanes)) * self._lanes
         if size >= count:
             roll_out(rows)
-        else:  # the calls release the interpreter
+        else:  # calls of the library release the interpreter, so threads run in parallel
             parts = [slice(k, k + size) for k in range(0, count, size)]
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(roll_out, ([x[part] for x in rows] for part in parts)))
@@ -127,13 +127,13 @@ class Loop:
 
 
 class Steps(Kind):
-    """The steps of a path.
+    """Steps of a path.
 
     Args:
         dynamics: the model.
         x: states at the start, ``(B, S)``.
         u: inputs of the first steps, ``(B, T, stages, M)``.
-        lengths: their lengths, ``(T,)``, s.
+        lengths: lengths of the first steps, ``(T,)``, s.
     """
 
     def __init__(self, dynamics: Any, x: Tensor, u: Tensor, lengths: Tensor):
@@ -145,7 +145,7 @@ class Steps(Kind):
         x, dynamics = self._x[0], self._dynamics
         step = {"increment": torch.zeros_like(x), "start": x}
         step |= {"inputs": self._u[0, 0], "h": self._lengths[0]}
-        if isinstance(dynamics, ContinuousPredictor):  # whose steps have stages
+        if isinstance(dynamics, ContinuousPredictor):  # its steps have stages
             dynamics = sharing(dynamics)
         return programs(_STEP, dynamics.integration_step, step, ["end"])
 
@@ -168,7 +168,7 @@ class Steps(Kind):
         return Loop(library, values)
 
     def agrees(self, function: Function) -> bool:
-        """Compare steps from states of a path, and from states and with inputs beside it."""
+        """Compare steps at states and inputs on and near a path."""
         example, h = (self._x[0], self._u[0, 0]), self._lengths.mean()
         path = function(torch.zeros_like(self._x), self._x, self._u, self._lengths)
         states = torch.cat([self._x[:, None], self._x[:, None] + path[:, :-1]], dim=1)
@@ -187,7 +187,7 @@ ONE = """\
 #define lanes(x) (x)
 typedef double real;
 """
-"""First lines of the code for one trajectory at a time, before the functions of the code."""
+"""First lines of the code for a single trajectory at a time."""
 
 SEVERAL = """\
 #include <math.h>
@@ -235,7 +235,7 @@ _functions += [
     f"PAIRWISE({f})\n#define {f}(x, y) lanes_{f}(lanes(x), lanes(y))" for f in _OF_TWO.split()
 ]
 SEVERAL = SEVERAL.replace("@functions@", "\n".join(_functions))
-"""The same for as many trajectories as a vector of the processor has numbers."""
+"""First lines of the code for several trajectories at a time, as many as fit into a vector."""
 
 LOOP = """
 #define LANE(x, l) (((double *)&(x))[l])

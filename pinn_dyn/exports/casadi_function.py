@@ -28,13 +28,13 @@ _NAMES |= {name: name for name in f"{_SAME} lt le gt ge eq".split()}
 
 
 def casadi_function(program: Program, name: str) -> casadi.Function:
-    """Return a program as a function of column vectors, which CasADi differentiates exactly.
+    """Return a program as a CasADi function of column vectors, with exact derivatives.
 
     An output with two axes is a matrix. The graph consists of matrix operations (``casadi.MX``).
 
     Raises:
-        ImportError: without CasADi.
-        TypeError: on an operation that CasADi does not have.
+        ImportError: if CasADi is not installed.
+        TypeError: if CasADi lacks an operation of the program.
     """
     ca = import_casadi()
     graph = program.graph_module.graph
@@ -62,15 +62,15 @@ def import_casadi() -> Any:
 
 
 def write_casadi(functions: Sequence[Any], path: Path, info: str, real: str) -> Calls:
-    """Write a function for ``casadi.Function.load``, and return it as read from the file.
+    """Write a function for ``casadi.Function.load``, and return the function of the file.
 
-    The file does not hold ``info``.
+    The file does not contain ``info``.
 
     Raises:
-        ValueError: on ``real="float"``.
+        ValueError: if ``real`` is ``"float"``.
     """
     if real != "double":
-        raise ValueError(f"{path}: CasADi computes with doubles: set real='double', or write a .c")
+        raise ValueError(f"{path}: CasADi computes with doubles: set real='double', or use .c")
     (function,) = functions
     casadi_function(function.program, function.name).save(str(path))
     loaded = import_casadi().Function.load(str(path))
@@ -83,13 +83,13 @@ def write_casadi(functions: Sequence[Any], path: Path, info: str, real: str) -> 
 
 
 class _CasadiWriter:
-    """The nodes of a program as columns of numbers, in the order of the rows of their tensors."""
+    """Nodes of a program as columns of numbers, in the row-major order of their tensors."""
 
     def __init__(self, ca: Any, values: dict[fx.Node, Any]):
         self.ca, self.values = ca, values
 
     def evaluate(self, node: fx.Node) -> Any:
-        """Return the numbers of an operation; a list for an operation with several results."""
+        """Return the numbers of an operation, or a list for an operation with several results."""
         arguments: list[Any] = list(node.args)
         if node.target is operator.getitem:
             return self.values[arguments[0]][arguments[1]]
@@ -116,7 +116,7 @@ class _CasadiWriter:
         return self._elementwise(node, name, [self._operand(x, shape) for x in arguments])
 
     def matrix(self, node: fx.Node) -> Any:
-        """Return the transpose of a matrix: CasADi stores columns."""
+        """Return the transpose of a matrix, since CasADi stores columns."""
         return self.ca.reshape(self.values[node], node.meta["val"].shape[1], -1)
 
     def _operand(self, argument: Any, shape: torch.Size) -> Any:
@@ -128,7 +128,7 @@ class _CasadiWriter:
         return self.values[argument][_flat(_positions(argument).expand(shape))]
 
     def _larger(self, x: Any, y: Any) -> Any:
-        """Return the larger number, and NaN if one is NaN, which ``fmax`` ignores."""
+        """Return the larger number, or NaN if a number is NaN, which ``fmax`` ignores."""
         if_else = self.ca.if_else
         return if_else(x > y, x, if_else(x <= y, y, x + y))
 

@@ -1,4 +1,4 @@
-"""A model as code in C, with the numbers and attributes that the model has at each call."""
+"""A model as code in C that uses the current numbers and attributes of the model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pinn_dyn.exports.watch import Watch
 log = logging.getLogger(__name__)
 
 BUILD_SECONDS = 1.0
-"""Processor time in Python after which code is built, about that of building it, s."""
+"""Processor time in Python after which code is built, s; about the time of building."""
 STATES = 20
 """Number of states at which code is compared with Python before it is used."""
 _MOST = 64
@@ -38,13 +38,13 @@ Function = Callable[..., Tensor]
 
 
 class Code(NamedTuple):
-    """Code of a kind of model, and where its numbers come from.
+    """Code of a kind of model, and the source of its numbers.
 
     Attributes:
         text: the code.
         constants: operations and results of the constants of each program, see :class:`Constants`.
-        leaves: for each program the tensors that these read: the number of a watched tensor, or a
-            tensor that no model has.
+        leaves: tensors that the constants of each program read: the index of a watched tensor, or a
+            tensor that does not belong to a model.
         order: positions of the arguments of the code among all constants, ``(n,)``.
         places, numbers: positions of the constants that the code contains, and their values.
     """
@@ -62,22 +62,22 @@ class Code(NamedTuple):
         Args:
             tensors: the watched tensors of the model.
         """
-        every = []
+        values = []
         for packed, sources in zip(self.constants, self.leaves, strict=True):
             leaves = [x if isinstance(x, Tensor) else tensors[x] for x in sources]
-            every.append(Constants.unpacked(packed, leaves).evaluate())
-        constants = torch.cat(every)
+            values.append(Constants.unpacked(packed, leaves).evaluate())
+        constants = torch.cat(values)
         if not torch.equal(constants[self.places], self.numbers):
             return None
         return torch.cat([constants[self.order], constants.new_zeros(1)])  # never empty
 
 
 class Kind(abc.ABC):
-    """A way to run a function of a model in C.
+    """A function of a model that can run in C.
 
     Attributes:
-        name: name of the function, also of settings that are not in the model.
-        flags: optimization.
+        name: name of the function, including settings that are not part of the model.
+        flags: flags of the compiler for the optimization.
     """
 
     name: str
@@ -85,32 +85,32 @@ class Kind(abc.ABC):
 
     @abc.abstractmethod
     def programs(self) -> dict[str, Program]:
-        """Record the function, after the parts that it calls."""
+        """Record the function as a program, after programs of the parts that it calls."""
 
     @abc.abstractmethod
     def text(self, programs: dict[str, Program], numbers: LiveNumbers) -> str:
-        """Return the code."""
+        """Return the C code."""
 
     @abc.abstractmethod
     def loaded(self, library: ctypes.CDLL, values: Tensor) -> Function:
-        """Return the function of a library."""
+        """Return the function of a loaded library."""
 
     @abc.abstractmethod
     def agrees(self, function: Function) -> bool:
-        """Return true if a function gives the numbers of Python at many states and inputs."""
+        """Return true if a function agrees with Python at many states and inputs."""
 
 
 class Compiled:
-    """Functions of a model in C, as long as neither a number nor an attribute has changed.
+    """Functions of a model in C, for the current numbers and attributes of the model.
 
-    Numbers come from the tensors of the model. A changed number or attribute is noticed at the next
-    call (:class:`Watch`). Code is used only after it agrees with Python at :data:`STATES` states,
-    also code from the cache folder. It is built when Python has taken :data:`BUILD_SECONDS`, unless
-    the folder has it. Python goes on where there is no C compiler or no C code for an operation,
-    and in threads that would wait for the build of another thread.
+    Numbers come from the tensors of the model. A change of a number or attribute is detected at the
+    next call (:class:`Watch`). Code, also from the cache folder, is used only after it agrees with
+    Python at :data:`STATES` states. If the folder has no code, it is built after Python has used
+    :data:`BUILD_SECONDS`. Python computes the function if there is no C compiler or no C code for
+    an operation, and while another thread builds the code.
 
     Args:
-        roots: the model, and further objects that the functions read.
+        roots: the model, and all other objects that the functions read.
     """
 
     is_unwatched = True
@@ -123,13 +123,13 @@ class Compiled:
         self._lock = threading.Lock()
 
     def __deepcopy__(self, memo: Any) -> None:
-        """Leave the copy of a model without code; the copy is another model."""
+        """Return None: the copy of a model has no code, since it is another model."""
 
     def __reduce__(self) -> Any:
         return type(None), ()
 
     def find(self, kind: Kind) -> Function | None:
-        """Return a function in C, or None where Python computes it."""
+        """Return a function in C, or None if Python must compute it."""
         watch = self._watch
         if watch is not None and not watch.changed():
             function = self._functions.get(kind.name)
@@ -143,13 +143,13 @@ class Compiled:
             self._lock.release()
 
     def rows(self, name: str, function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
-        """Return a function of rows, in C if possible.
+        """Evaluate a function of rows, in C if possible.
 
         Args:
-            name: name of the function, which this object computes for the same roots only.
-            function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently. It
-                reads the roots alone.
-            rows: its argument.
+            name: name of the function, unique among the functions of this object.
+            function: function that maps ``(*batch, n)`` to ``(*batch, m)`` row by row. It must read
+                only the roots.
+            rows: argument of the function.
         """
         if not rows.numel() or rows.dtype != torch.float64 or not rows.is_cpu:
             return function(rows)
@@ -162,7 +162,7 @@ class Compiled:
 
     @contextmanager
     def in_python(self, kind: Kind) -> Iterator[None]:
-        """Count the processor time of a context, in which Python computes a function."""
+        """Count the processor time of a context in which Python computes a function."""
         start = time.thread_time()
         try:
             yield
@@ -180,7 +180,7 @@ class Compiled:
         key = self._key(kind)
         try:
             function = self._known(key, kind) or self._built(key, kind)
-        except Exception:  # from a head that cannot be traced, a compiler or a full disk
+        except Exception:  # a head that cannot be traced, an error of the compiler, a full disk
             log.debug("no code in C for %s", kind.name, exc_info=True)
             _SECONDS[key] = -float("inf")
             return None
@@ -189,7 +189,7 @@ class Compiled:
         return function
 
     def _known(self, key: str, kind: Kind) -> Function | None:
-        """Return the function of code that this process or the cache folder has."""
+        """Return the function from code in this process or in the cache folder, or None."""
         code = _CODES.get(key)
         if code is None and key not in _SECONDS:
             _SECONDS[key] = 0.0
@@ -211,15 +211,13 @@ class Compiled:
 
     def _code(self, programs: dict[str, Program], kind: Kind) -> Code:
         constants = [program.constants for program in programs.values()]
-        every = torch.cat([x.evaluate() for x in constants])
-        numbers = LiveNumbers([*programs.values()], every)
+        numbers = LiveNumbers([*programs.values()], torch.cat([x.evaluate() for x in constants]))
         text = kind.text(programs, numbers)
         assert self._watch is not None
         addresses = {_identity(x): k for k, x in enumerate(self._watch.tensors)}
-        leaves = [
-            [addresses.get(_identity(x), x.detach().clone()) for x in item.leaves]
-            for item in constants
-        ]
+        leaves = []
+        for item in constants:
+            leaves.append([addresses.get(_identity(x), x.detach().clone()) for x in item.leaves])
         return Code(
             text,
             [item.packed() for item in constants],
@@ -230,7 +228,7 @@ class Compiled:
         )
 
     def _loaded(self, key: str, code: Code, kind: Kind) -> Function | None:
-        """Return the function of code with the present numbers, if it agrees with Python."""
+        """Return the function of code with the current numbers, or None if Python disagrees."""
         assert self._watch is not None
         values = code.values(self._watch.tensors)
         if values is None:
@@ -245,9 +243,9 @@ class Compiled:
 
 
 _CODES: dict[str, Code] = {}
-"""Code of this process by the digest of a kind of model."""
+"""Code in this process, by the digest of a kind of model."""
 _SECONDS: defaultdict[str, float] = defaultdict(float)
-"""Processor time of Python by the digest of a kind of model; -inf where C is not possible."""
+"""Processor time of Python, by the digest of a kind of model; -inf if C is not possible."""
 
 
 def _identity(value: Tensor) -> tuple[Any, ...]:
@@ -255,10 +253,10 @@ def _identity(value: Tensor) -> tuple[Any, ...]:
 
 
 def agree(results: Tensor, expected: Tensor) -> bool:
-    """Return true if results ``(K, ...)`` are the expected ones up to rounding.
+    """Return true if results ``(K, ...)`` equal the expected results up to rounding.
 
-    Differences are relative to the norm of a row, or to the RMS of all norms if this is larger.
-    Where an expected row is not finite, the result must not be finite.
+    Differences are relative to the norm of a row, or to the RMS of all norms if this is larger. If
+    an expected row is not finite, the result must not be finite either.
     """
     rows, truth = results.flatten(1), expected.flatten(1)
     finite = truth.isfinite().all(-1)
@@ -270,7 +268,7 @@ def agree(results: Tensor, expected: Tensor) -> bool:
 
 
 def spread_around(rows: Tensor) -> Tensor:
-    """Return :data:`STATES` rows: a half of the given ones ``(K, n)``, and a half beside them."""
+    """Return :data:`STATES` rows: one half from ``rows`` ``(K, n)``, one half near them."""
     picked = rows[torch.linspace(0, len(rows) - 1, STATES // 2).round().long()]
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(2, *picked.shape, generator=generator, dtype=rows.dtype)
@@ -280,12 +278,13 @@ def spread_around(rows: Tensor) -> Tensor:
 
 
 class _Rows(Kind):
-    """A function of the rows of tensors, which computes them independently."""
+    """A function that maps the rows of a tensor independently."""
 
     flags = QUICK
 
     def __init__(self, name: str, function: Callable[[Tensor], Tensor], rows: Tensor):
-        self.name, self._function, self._rows = name, function, rows.reshape(-1, rows.shape[-1])
+        self.name, self._function = name, function
+        self._rows = rows.reshape(-1, rows.shape[-1])
 
     def programs(self) -> dict[str, Program]:
         return programs("row", self._function, {"x": self._rows[0]}, ["y"])
@@ -311,7 +310,7 @@ class _Rows(Kind):
 
         def call(rows: Tensor) -> Tensor:
             if rows.shape[-1] != n or rows.dtype != torch.float64 or not rows.is_cpu:
-                return function(rows)  # which refuses wrong shapes
+                return function(rows)  # raises errors for wrong shapes
             rows = rows.contiguous()
             result = rows.new_empty(*rows.shape[:-1], m)
             library.rows(values.data_ptr(), rows.numel() // n, rows.data_ptr(), result.data_ptr())

@@ -1,4 +1,4 @@
-"""Operations in terms of those that all exports have, and factorizations of small matrices."""
+"""Decompositions into operations that all exports have, and factorizations of small matrices."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SWEEPS = 6  # of Jacobi rotations
 
 
 def cholesky(matrix: Tensor) -> Tensor:
-    """Return the lower L with L L^T = matrix, ``(*batch, n, n)``; NaN where it has none."""
+    """Return the lower L with L L^T = matrix, ``(*batch, n, n)``; NaN if there is no such L."""
     columns: list[Tensor] = []
     size = matrix.shape[-1]
     for j in range(size):
@@ -30,9 +30,9 @@ def solve_triangular(matrix: Tensor, right: Tensor, upper: bool) -> Tensor:
     rows: dict[int, Tensor] = {}
     for i in reversed(range(size)) if upper else range(size):
         rows[i] = right[..., -1 if upper else 0, :] / matrix[..., i, i : i + 1]
-        others = slice(0, i) if upper else slice(i + 1, size)
-        of_others = right[..., :-1, :] if upper else right[..., 1:, :]
-        right = of_others - matrix[..., others, i : i + 1] * rows[i].unsqueeze(-2)
+        unsolved = slice(0, i) if upper else slice(i + 1, size)
+        right = right[..., :-1, :] if upper else right[..., 1:, :]
+        right = right - matrix[..., unsolved, i : i + 1] * rows[i].unsqueeze(-2)
     return torch.stack([rows[i] for i in range(size)], dim=-2)
 
 
@@ -57,16 +57,16 @@ def qr(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pseudo_inverse(matrix: Tensor, rtol: Any) -> Tensor:
-    """Return the inverse ``(*batch, k, n)`` of a small matrix without the smallest singular values.
+    """Return the pseudo-inverse ``(*batch, k, n)`` of a small matrix.
 
-    Six sweeps of Jacobi rotations make its columns orthogonal. Singular values up to ``rtol`` times
-    the largest are zero.
+    Six sweeps of Jacobi rotations make the columns orthogonal. Singular values up to ``rtol`` times
+    the largest count as zero.
 
     Source: Hestenes 1958, "Inversion of matrices by biorthogonalization and related results".
     """
     size = matrix.shape[-1]
-    one = torch.eye(size, dtype=matrix.dtype)
-    vectors = one
+    unit = torch.eye(size, dtype=matrix.dtype)
+    vectors = unit
     for i, j in [*itertools.combinations(range(size), 2)] * _SWEEPS:
         a, b = matrix[..., i], matrix[..., j]
         difference, product = ((b - a) * (b + a)).sum(-1), 2 * (a * b).sum(-1)
@@ -74,9 +74,10 @@ def pseudo_inverse(matrix: Tensor, rtol: Any) -> Tensor:
         total = difference + torch.where(difference < 0, -length, length)
         tangent = torch.where(total == 0, 0.0, product / torch.where(total == 0, 1.0, total))
         cosine = 1 / (1 + tangent * tangent).sqrt()
-        plane, turn = one[i].diag() + one[j].diag(), one[i].outer(one[j]) - one[j].outer(one[i])
+        plane = unit[i].diag() + unit[j].diag()
+        turn = unit[i].outer(unit[j]) - unit[j].outer(unit[i])
         cosine, sine = cosine[..., None, None], (tangent * cosine)[..., None, None]
-        rotation = one + (cosine - 1) * plane + sine * turn
+        rotation = unit + (cosine - 1) * plane + sine * turn
         matrix, vectors = matrix @ rotation, vectors @ rotation
     squares = (matrix * matrix).sum(-2, keepdim=True)
     is_zero = squares <= rtol * rtol * squares.amax(-1, keepdim=True)
@@ -89,7 +90,7 @@ def _pinv(A: Tensor, *, atol: Any = None, rtol: Any = None, hermitian: bool = Fa
 
 
 def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = False) -> Any:
-    failed = torch.zeros(matrix.shape[:-2], dtype=torch.int32)  # the factor is NaN where it fails
+    failed = torch.zeros(matrix.shape[:-2], dtype=torch.int32)  # a failure gives NaN instead
     return cholesky(matrix), failed
 
 
@@ -99,7 +100,7 @@ def _cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tenso
 
 
 def _solve_ex(A: Tensor, B: Tensor, *, left: bool = True, check_errors: bool = False) -> Any:
-    # By reflections, which need no pivots, so that the operations do not depend on the numbers.
+    # Reflections need no pivots, so the operations do not depend on the numbers.
     Q, R = qr(A)
     vector = B.ndim == A.ndim - 1
     right = B.unsqueeze(-1) if vector else B

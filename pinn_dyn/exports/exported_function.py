@@ -1,4 +1,4 @@
-"""Functions in files for other programs, each compared with its original."""
+"""Functions for files, and the comparison of a file with its function."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 Real = Literal["double", "float"]
 Call = Callable[..., Sequence[np.ndarray]]
-"""Function of K values of each input, ``(K, *shape)``, which returns those of each output."""
+"""Function from K values of each input, ``(K, *shape)``, to K values of each output."""
 Calls = Mapping[str, Call]
-"""The functions of a written file by name."""
+"""Functions of a written file, by name."""
 
 Ranges = Mapping[str, tuple[Tensor, Tensor]]
 """Smallest and largest values of inputs by name, for the states of the comparison."""
@@ -46,16 +46,16 @@ ENDINGS = tuple(_WRITERS)
 
 
 class ExportedFunction:
-    """A function of a single state, and the states where its file is compared with it.
+    """A function of a single state, and the states at which its file is compared with it.
 
     Args:
-        name: the name in the file.
-        function: takes the inputs by position, and returns a tensor for each output.
+        name: name of the function in the file.
+        function: function that takes the inputs by position, and returns a tensor per output.
         inputs: values of each input by name, ``(200, *shape)``, float64.
         outputs: names of the outputs.
         about: units and meaning, for the file.
-        model: the model of which the function calls a part several times, or None. The function
-            takes a copy that calls this part as ``model=``.
+        model: a model with a part that the function calls several times, or None. The function
+            takes a copy of the model with a shared part as ``model=``.
     """
 
     def __init__(
@@ -73,14 +73,14 @@ class ExportedFunction:
 
     @cached_property
     def program(self) -> Program:
-        """The operations of the function."""
+        """Operations of the function."""
         from pinn_dyn.exports.program import trace
 
         example = {name: values[0] for name, values in self.inputs.items()}
         return trace(self.function, example, self.outputs)
 
     def programs(self) -> dict[str, Program]:
-        """Return the operations by name, first those of the parts that it calls."""
+        """Return the operations of the called parts and of the function, by name."""
         from pinn_dyn.exports.repeated import programs, sharing
 
         example = {name: values[0] for name, values in self.inputs.items()}
@@ -90,14 +90,14 @@ class ExportedFunction:
         return programs(self.name, function, example, self.outputs)
 
     def compare(self, call: Call, real: Real) -> None:
-        """Compare with a function of the file, whose numbers have the type ``real``.
+        """Compare the function with that of a file with numbers of the type ``real``.
 
         A difference is relative to the norm of the output at the state, or to the RMS of the norms
         over all states if this is larger.
 
         Raises:
             RuntimeError: if a difference exceeds the tolerance of the type, the file returns
-                another type, or no value of the original is finite.
+                another type, or the function has no finite value.
         """
         tolerance = TOLERANCES[real]
         states = [*zip(*self.inputs.values(), strict=True)]
@@ -140,27 +140,27 @@ def write(
     info: Mapping[str, Any],
     real: Real = "double",
 ) -> Path:
-    """Write functions to a file of the format of its ending, and compare the file with them.
+    """Write functions to a file in the format of its ending, and compare the file with them.
 
     Args:
-        functions: the functions; only C files hold several.
-        path: ``.c``, ``.onnx`` or ``.casadi``; a ``.h`` goes beside a ``.c``.
-        info: names, gains and sizes that the file holds as JSON, together with the version.
+        functions: the functions. Only C files can contain several functions.
+        path: ``.c``, ``.onnx`` or ``.casadi``. With a ``.c``, a ``.h`` is written.
+        info: names, gains and sizes, which the file contains as JSON, with the version.
         real: type of the numbers.
 
     Raises:
-        RuntimeError: if the file differs from the functions by more than 1e-9 (double) or 1e-4
-            (float), relative; no file is left.
-        TypeError: if the format does not have an operation.
+        RuntimeError: if the file differs from the functions by a relative error of more than 1e-9
+            (double) or 1e-4 (float). The file is deleted.
+        TypeError: if the format lacks an operation.
     """
     module, writer = _WRITERS[path.suffix].split(":")
     path.parent.mkdir(parents=True, exist_ok=True)
     version = importlib.import_module("pinn_dyn").__version__
     text = json.dumps({"pinn_dyn": version, "real": real, **info}, default=listed)
-    for old in path.parent.glob(f"{_TEMPORARY}*"):  # of programs that were killed
+    for old in path.parent.glob(f"{_TEMPORARY}*"):  # folders of killed programs
         if time.time() - old.stat().st_mtime > _DAY:
             shutil.rmtree(old, ignore_errors=True)
-    # Written beside its place and then moved: a failure leaves the previous file, or none.
+    # Write to a temporary folder and move the file: after a failure, the old file is unchanged.
     with TemporaryDirectory(dir=path.parent, prefix=_TEMPORARY) as folder:
         partial = Path(folder) / path.name
         calls: Calls = getattr(importlib.import_module(module), writer)(
@@ -179,8 +179,8 @@ def drawn_states(
 ) -> dict[str, Tensor]:
     """Return 200 values of inputs by name, ``(200, size)``, or ``(200,)`` for the size None.
 
-    They are uniform within the range of an input, or [-1, 1], with a fixed seed. ``q_ref`` and
-    ``u_next`` have the ranges of ``q`` and ``u``, which ``q_past`` repeats.
+    The values are uniform within the range of the input, by default [-1, 1], with a fixed seed.
+    ``q_ref`` and ``u_next`` have the ranges of ``q`` and ``u``. ``q_past`` repeats that of ``q``.
     """
     generator = torch.Generator().manual_seed(0)
     unit = torch.ones((), dtype=torch.float64)
@@ -197,5 +197,5 @@ def drawn_states(
 
 
 def identifier(text: str) -> str:
-    """Return a name as it may stand in a C file."""
+    """Convert a name to an identifier in C."""
     return re.sub(r"^(?=\d)", "_", re.sub(r"\W", "_", text, flags=re.ASCII))

@@ -14,12 +14,12 @@ from pinn_dyn.exports.compiled import STATES, Compiled
 
 
 class LatentLoop(nn.Module):
-    """Steps of the latent state of a model, in C for long paths in float64 without gradients.
+    """Steps of a model's latent state, in C for long paths in float64 without gradients.
 
-    See :class:`~.compiled.Compiled` for the conditions of a loop.
+    See :class:`~.compiled.Compiled` for the conditions of code in C.
 
     Args:
-        model: the model, whose ``latent_path(z, ends)`` it replaces in :meth:`install`.
+        model: the model. :meth:`install` replaces its ``latent_path(z, ends)``.
         threads: number of threads that share the trajectories.
     """
 
@@ -29,7 +29,7 @@ class LatentLoop(nn.Module):
         self._compiled = Compiled(self)
 
     def install(self) -> None:
-        """Replace the method of the model, for this object alone."""
+        """Replace the method of this model object."""
         vars(self.model)["latent_path"] = self.latent_path
 
     def _steps(self, z: Tensor, ends: Tensor) -> Sequence[Tensor]:

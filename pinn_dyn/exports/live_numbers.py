@@ -1,4 +1,4 @@
-"""Constants of C code that are arguments, so that models of one structure share the code."""
+"""Constants of C code as arguments, for models with the same structure to share the code."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pinn_dyn.exports.program import Program
 
 
 class LiveNumbers(ConstantArrays):
-    """Arrays whose numbers the code reads from its argument ``values``.
+    """Constant arrays whose numbers the code reads from its argument ``values``.
 
-    The code contains those numbers of a model that are 0, 1 or -1, which often follow from its
-    structure. It is that of other models only if they have the same numbers there.
+    The code contains the numbers 0, 1 and -1, which often follow from the structure of the model.
+    Another model can share the code only if it has the same numbers at these positions.
 
     Args:
         programs: the programs of the code.
-        numbers: all constants of the programs one after the other, ``(n,)``.
+        numbers: all constants of the programs in a row, ``(n,)``.
 
     Attributes:
-        index: positions of the numbers that ``values`` holds in turn.
-        fixed: number that the code contains, by its position.
+        index: positions in ``numbers`` of the entries of ``values``.
+        fixed: numbers that the code contains, by position.
     """
 
     arguments = ("values",)
@@ -51,11 +51,11 @@ class LiveNumbers(ConstantArrays):
             self._fix(values)
             return super().elements(values)
         positions = self._positions(values)
-        place = self._place(positions)
+        start = self._place(positions)
         numbers: list[float | str] = []
         for k, position in enumerate(positions.tolist()):
             number = self._fixed(position)
-            numbers.append(f"VALUES[{place + k}]" if number is None else number)
+            numbers.append(f"VALUES[{start + k}]" if number is None else number)
         return numbers
 
     def common(self, values: Tensor) -> float | None:
@@ -84,7 +84,7 @@ class LiveNumbers(ConstantArrays):
         return self._places[key]
 
     def _fix(self, values: Tensor) -> None:
-        """Let the code contain indices or truth values, which the operations may have made."""
+        """Write indices and booleans, which operations on constants may give, into the code."""
         if values.untyped_storage().data_ptr() in self._starts:
             positions = self._positions(values).tolist()
             self.fixed.update(zip(positions, values.flatten().double().tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""The functions of a model that other programs call."""
+"""Functions of a model for other programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
     """Return the functions of a model in float64, without gradients.
 
     - mechanical systems: ``forward_dynamics(q, v, u)``, ``inverse_dynamics(q, v, a)`` and
-      ``terms(q)``, which are M, D, G and A, with matrices row by row;
+      ``terms(q)``, which returns M, D, G and A, with matrices row by row;
     - black boxes of the acceleration: ``forward_dynamics``;
     - both: ``step(q, v, u, h)``, q and v after h seconds with u held, by the model's integrator;
     - black boxes of the next state: ``next_state(q, v, u, u_next)`` after the model's step;
@@ -27,10 +27,11 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
 
     Args:
         model: the model.
-        ranges: of q, v, u, a and h; the default is [-1, 1], and [0.5, 1.5] ms for h.
+        ranges: smallest and largest q, v, u, a and h; the default is [-1, 1], and [0.5, 1.5] ms for
+            h.
 
     Raises:
-        TypeError: on a model without these functions, such as an ensemble.
+        TypeError: if the model has none of these functions, such as an ensemble.
     """
     n, m = model.num_coordinates, model.num_inputs
     sizes = {"q": n, "v": n, "a": n, "u": m, "u_next": m, "h": None}

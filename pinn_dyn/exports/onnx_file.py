@@ -1,4 +1,4 @@
-"""ONNX files of functions, run by ONNX Runtime for a comparison."""
+"""ONNX files of functions, compared with Python by ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ _REDUCTIONS = {"sum": "ReduceSum", "amin": "ReduceMin", "amax": "ReduceMax"}
 
 
 def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, real: Real) -> Calls:
-    """Write a function to an ONNX file of opset 18, whose inputs and outputs have its names.
+    """Write a function to an ONNX file of opset 18, with the names of its inputs and outputs.
 
-    Inputs and outputs have a batch dimension in front, ``(batch, *shape)``.
+    Inputs and outputs have a leading batch dimension, ``(batch, *shape)``.
 
-    ``metadata_props`` hold the fields of ``info``, and the SHA-256 of the graph.
+    ``metadata_props`` contain the fields of ``info`` and the SHA-256 of the graph.
 
     Raises:
-        ImportError: without onnx and onnxruntime.
-        ValueError: on several functions.
+        ImportError: if onnx or onnxruntime is not installed.
+        ValueError: if there are several functions.
     """
     try:
         import onnx
@@ -79,12 +79,12 @@ def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, rea
 
 
 def _single(name: str) -> str:
-    """Return the name of an input or output in the graph of a state."""
+    """Return the name of an input or output in the graph of a single state."""
     return f"{name} of a state"
 
 
 class _OnnxWriter:
-    """The nodes of a program as nodes of ONNX, with their names."""
+    """Nodes of a program as nodes of ONNX, with their names."""
 
     def __init__(self, helper: Any, dtype: Any):
         self.helper, self.dtype = helper, dtype
@@ -93,7 +93,7 @@ class _OnnxWriter:
         self.names: dict[fx.Node, Any] = {}
 
     def graph(self, function: ExportedFunction) -> Any:
-        """Return a graph that maps the graph of a state over a batch."""
+        """Return a graph that applies the graph of a single state to a batch."""
         program = function.program
         placeholders = program.graph_module.graph.find_nodes(op="placeholder")
         self.names = dict(zip(placeholders, map(_single, program.inputs), strict=True))
@@ -121,7 +121,7 @@ class _OnnxWriter:
         return self.helper.make_tensor_value_info(name, kind, [*shape])
 
     def constant(self, value: Any, dtype: Any = None) -> str:
-        """Return the name of a constant, stored once."""
+        """Return the name of a constant. Equal constants are stored once."""
         array = np.asarray(value.detach() if isinstance(value, Tensor) else value)
         if dtype is None and array.dtype not in (np.bool_, np.int64):
             dtype = self.dtype
@@ -145,7 +145,7 @@ class _OnnxWriter:
         return self.names[x] if isinstance(x, fx.Node) else self.constant(x, dtype or self.dtype)
 
     def real(self, x: Any) -> str:
-        """Return an operand as a number, also the result of a comparison."""
+        """Return an operand as a number; convert booleans and integers."""
         name = self.operand(x)
         if isinstance(x, fx.Node) and x.meta["val"].dtype in (torch.bool, torch.int64):
             kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(self.dtype))
@@ -177,7 +177,7 @@ class _OnnxWriter:
         return self.node(kind, operands)
 
     def _move(self, node: fx.Node) -> Any:
-        """Gather the numbers of a result from those of its sources."""
+        """Write an operation that gathers the numbers of a result from its sources."""
         sources, index = moved(node)
         shape = self.constant([-1], np.int64)
         flat = [self.node("Reshape", [self.operand(x), shape]) for x in sources]

@@ -1,4 +1,4 @@
-"""A function of small tensors as a list of elementary operations of fixed shapes."""
+"""A function of small tensors as a list of elementary operations with fixed shapes."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _OF_SHAPES_ALONE = (
 
 
 class Constants:
-    """Numbers of a program that follow from tensors of the model alone.
+    """Numbers of a program that depend only on tensors of the model.
 
     Attributes:
         leaves: tensors that the operations read.
-        operations: function in :data:`torch.ops.aten`, arguments and options, where ``"%k"`` is
-            leaf k, or the result of an operation, counted after the last leaf.
-        results: which of these the program reads.
+        operations: functions in :data:`torch.ops.aten`, with arguments and options. The argument
+            ``"%k"`` is leaf k, or, after the last leaf, the result of an operation.
+        results: indices of the leaves and results that the program reads.
     """
 
     def __init__(
@@ -46,17 +46,13 @@ class Constants:
         self.leaves, self.operations, self.results = [*leaves], [*operations], [*results]
 
     def evaluate(self) -> Tensor:
-        """Return all numbers that the program reads one after the other, ``(n,)``, float64."""
+        """Return all numbers that the program reads in a row, ``(n,)``, float64."""
         values: list[Any] = [*self.leaves]
         with torch.no_grad():
             for function, arguments, options in self.operations:
                 values.append(function(*_replaced(arguments, values), **_replaced(options, values)))
             arrays = [values[k].detach().flatten().double() for k in self.results]
         return torch.cat([torch.zeros(0, dtype=torch.float64), *arrays])
-
-    def with_leaves(self, leaves: Sequence[Tensor]) -> Constants:
-        """Return the same operations on other leaves."""
-        return Constants(leaves, self.operations, self.results)
 
     def packed(self) -> list[Any]:
         """Return the operations and results without the leaves, as plain values."""
@@ -68,7 +64,8 @@ class Constants:
     def unpacked(cls, packed: Sequence[Any], leaves: Sequence[Tensor]) -> Constants:
         """Return the constants of :meth:`packed` operations with other leaves."""
         steps, results = packed
-        return cls(leaves, [[_function(name), *rest] for name, *rest in steps], results)
+        operations = [[_function(name), *arguments] for name, *arguments in steps]
+        return cls(leaves, operations, results)
 
 
 def _function(name: str) -> Any:
@@ -80,7 +77,7 @@ def _function(name: str) -> Any:
 
 
 def _replaced(item: Any, values: Any) -> Any:
-    """Return arguments with the values of their references."""
+    """Replace references such as ``"%3"`` in arguments by their values."""
     if isinstance(item, str) and item.startswith("%"):
         return values[int(item[1:])]
     if isinstance(item, (list, tuple)):
@@ -91,16 +88,16 @@ def _replaced(item: Any, values: Any) -> Any:
 
 
 class Program:
-    """The operations of a function for one state, without control flow and random numbers.
+    """Operations of a function of a single state, without control flow and random numbers.
 
-    All numbers are float64. Every node of the graph has ``meta["val"]``, its value at the example
-    inputs, of which shapes and strides hold for all inputs. Operations on constants alone are
-    evaluated and stored.
+    All numbers are float64. Each node of the graph has ``meta["val"]``, its value at the example
+    inputs. Its shape and strides hold for all inputs. Results of operations on constants are
+    computed once and stored.
 
     Attributes:
         graph_module: the operations, by name in :data:`torch.ops.aten`.
-        inputs, outputs: shape of each input and output by its name, in the order of the function.
-        constants: evaluation of the stored constants, from the tensors that the function reads.
+        inputs, outputs: shape of each input and output by name, in the order of the function.
+        constants: computation of the stored constants from the tensors that the function reads.
     """
 
     def __init__(
@@ -137,10 +134,10 @@ def operation(node: fx.Node) -> str:
 
 
 def moved(node: fx.Node) -> tuple[list[fx.Node], Any]:
-    """Return the sources of an operation that moves numbers, and the positions that it reads.
+    """Return the sources of an operation that only moves numbers, and the positions that it reads.
 
-    The positions have the shape of the result and count the numbers of all sources in turn. They
-    are a list for an operation with several results.
+    The positions have the shape of the result and count the numbers of all sources in a row. For an
+    operation with several results, they are a list.
     """
     sources: list[fx.Node] = []
 
@@ -158,10 +155,10 @@ def moved(node: fx.Node) -> tuple[list[fx.Node], Any]:
 
 
 def unsupported(node: fx.Node, form: str) -> TypeError:
-    """Return the error for an operation that an export does not have, with its line of code."""
+    """Return an error for an operation that an export lacks, with the line of code."""
     line = f", {node.meta['line']}" if node.meta.get("line") else ""
     return TypeError(
-        f"{node.target}{line}: {form} has no such operation, write the head with others"
+        f"{node.target}{line}: {form} has no such operation, write the head with other operations"
     )
 
 
@@ -169,7 +166,7 @@ _IS_TRACED: ContextVar[bool] = ContextVar("is_traced", default=False)
 
 
 def is_traced() -> bool:
-    """Return true while a function is recorded or compiled: its operations may not branch."""
+    """Return true while a function is recorded or compiled, and must not branch on values."""
     return _IS_TRACED.get() or torch.compiler.is_compiling()
 
 
@@ -180,11 +177,11 @@ def trace(
 ) -> Program:
     """Record a function at example inputs, without a batch dimension, in float64.
 
-    The function runs once, on numbers. Operations are recorded by a mode of this thread.
+    The function runs once, at these inputs. The operations of this thread are recorded.
 
     Args:
-        function: takes the inputs by position, and returns a tensor for each output.
-        inputs: example value of each input by its name.
+        function: function that takes the inputs by position, and returns a tensor per output.
+        inputs: example value of each input, by name.
         outputs: names of the outputs.
 
     Raises:
@@ -226,10 +223,10 @@ _CHECKS = (
 
 
 class _Recorder(TorchDispatchMode):
-    """Mode that records the operations on inputs, and those on constants alone beside them.
+    """Mode that records the operations on inputs, and separately the operations on constants.
 
     Args:
-        inputs: value of each input by name.
+        inputs: value of each input, by name.
     """
 
     def __init__(self, inputs: Mapping[str, Tensor]):
@@ -239,13 +236,13 @@ class _Recorder(TorchDispatchMode):
         self._nodes: dict[int, fx.Node] = {}
         self._numbers: dict[int, int] = {}
         self._constants: list[Tensor | tuple[Any, Any, Any]] = []
-        self._kept: list[Any] = []  # an address names a tensor for as long as the tensor lives
+        self._kept: list[Any] = []  # keeps tensors alive, since their addresses identify them
         for name, value in inputs.items():
             self._keep(value, self._graph.placeholder(name))
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # else PyTorch imports its compiler, which takes three seconds
+        return False  # otherwise PyTorch imports its compiler, which takes three seconds
 
     def __torch_dispatch__(
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None
@@ -311,10 +308,7 @@ class _Recorder(TorchDispatchMode):
         values = tree_leaves(result)
         if not all(isinstance(x, Tensor) for x in values):
             return
-        reference = tree_map(
-            lambda x: f"%{self._number(x)}" if isinstance(x, Tensor) else x, (args, options)
-        )
-        self._add((function, *reference), result)
+        self._add((function, *tree_map(self._reference, (args, options))), result)
         if not isinstance(result, Tensor):
             parent = f"%{len(self._constants) - 1}"
             for k, value in enumerate(result):
@@ -323,8 +317,11 @@ class _Recorder(TorchDispatchMode):
     def _leaf(self, value: Tensor) -> None:
         self._add(value, value)
 
+    def _reference(self, value: Any) -> Any:
+        return f"%{self._number(value)}" if isinstance(value, Tensor) else value
+
     def _number(self, value: Tensor) -> int:
-        """Return the number of a constant. A tensor that no operation has made is a leaf."""
+        """Return the index of a constant. A tensor without a recorded operation is a leaf."""
         if id(value) not in self._numbers:
             self._leaf(value)
         return self._numbers[id(value)]
@@ -335,7 +332,7 @@ class _Recorder(TorchDispatchMode):
         self._constants.append(entry)
 
     def finished(self, results: Sequence[Tensor]) -> tuple[fx.GraphModule, Constants]:
-        """Return the graph with these results, and the evaluation of its constants."""
+        """Return the graph with these results, and the computation of its constants."""
         output = self._graph.output([self._operand(x) for x in results])
         output.meta["val"] = [*results]
         self._graph.eliminate_dead_code()
@@ -345,7 +342,7 @@ class _Recorder(TorchDispatchMode):
         return module, self._needed([int(x.target.removeprefix("constant_")) for x in stored])
 
     def _needed(self, results: Sequence[int]) -> Constants:
-        """Return the constants that some of them follow from, the leaves first."""
+        """Return the constants from which ``results`` are computed, leaves first."""
         needed = set(results)
         for k in reversed(range(len(self._constants))):
             entry = self._constants[k]
@@ -354,15 +351,15 @@ class _Recorder(TorchDispatchMode):
                 needed |= {int(x[1:]) for x in references if x.startswith("%")}
         entries = {k: self._constants[k] for k in sorted(needed)}
         leaves = {k: x for k, x in entries.items() if isinstance(x, Tensor)}
-        others = {k: x for k, x in entries.items() if not isinstance(x, Tensor)}
-        order = {k: place for place, k in enumerate([*leaves, *others])}
-        names = {k: f"%{place}" for k, place in order.items()}
-        operations = [_replaced(x, names) for x in others.values()]
+        computed = {k: x for k, x in entries.items() if not isinstance(x, Tensor)}
+        order = {k: position for position, k in enumerate([*leaves, *computed])}
+        names = {k: f"%{position}" for k, position in order.items()}
+        operations = [_replaced(x, names) for x in computed.values()]
         return Constants([*leaves.values()], operations, [order[k] for k in results])
 
 
 def _line_of_code() -> str:
-    """Return the innermost line of code outside PyTorch and the exports."""
+    """Return the innermost line of code outside of PyTorch and this package."""
     frame: FrameType | None = sys._getframe(2)
     while frame is not None and frame.f_code.co_filename.startswith(_FOLDERS):
         frame = frame.f_back
@@ -375,7 +372,7 @@ _FOLDERS = (str(Path(torch.__file__).parent), str(Path(__file__).parent), contex
 
 
 # torch.library.custom_op would import the compiler of PyTorch, which takes three seconds.
-if not hasattr(torch.ops.pinn_dyn, "call"):  # a module that is imported again
+if not hasattr(torch.ops.pinn_dyn, "call"):  # exists if this module is imported again
     _LIBRARY = torch.library.Library("pinn_dyn", "DEF")
     _LIBRARY.define("call(str name, Tensor x, Tensor rows, int size) -> Tensor")
     _LIBRARY.impl("call", lambda name, x, rows, size: x.new_ones(size), "CompositeExplicitAutograd")

@@ -1,4 +1,4 @@
-"""Functions that a program calls several times: C code has them once, and calls them in a loop."""
+"""Functions that a program calls several times. C code contains them once, and calls in a loop."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Function = Callable[[Tensor, Tensor], Tensor]
 
 _PARTS: ContextVar[dict[str, tuple[Function, Tensor, Tensor]] | None]
 _PARTS = ContextVar("parts", default=None)
-"""Repeated functions of the program that is recorded by name, with example arguments."""
+"""Repeated functions of the currently recorded program by name, with example arguments."""
 _SIZES: ContextVar[Mapping[str, int]] = ContextVar("sizes", default=MappingProxyType({}))
-"""Repeated functions that the recorded program calls, with the sizes of their results."""
+"""Repeated functions of the currently recorded program, with the sizes of their results."""
 
 
 def repeated(name: str, function: Function, x: Tensor, rows: Tensor) -> Tensor:
@@ -30,10 +30,10 @@ def repeated(name: str, function: Function, x: Tensor, rows: Tensor) -> Tensor:
 
     Args:
         name: name of the function in C code.
-        function: takes x ``(*batch, S)`` and a row ``(*batch, R)``, and returns the next x. With
-            a single row, the result may have another size.
-        x: the start.
-        rows: the rows, the first one first.
+        function: function from x ``(*batch, S)`` and a row ``(*batch, R)`` to the next x. With a
+            single row, the result may have another size.
+        x: the first x.
+        rows: the rows, in the order of the calls.
     """
     size = _SIZES.get().get(name)
     if size is not None:
@@ -47,10 +47,10 @@ def repeated(name: str, function: Function, x: Tensor, rows: Tensor) -> Tensor:
 
 
 def sharing(model: Any) -> Any:
-    """Return a shallow copy of a model whose steps call one function for all their stages.
+    """Return a shallow copy of a model whose steps call a shared function in all stages.
 
-    The function is the mass matrix and the bias force of a system with sticking friction, in one
-    array, or the state derivative of another model. The copy has the tensors of the model.
+    For a system with sticking friction, the function returns the mass matrix and the bias force in
+    an array. For any other model, it is the state derivative. The copy has the model's tensors.
     """
     shared, integrator = copy.copy(model), model.integrator
     while isinstance(integrator, Wrapped):
@@ -81,7 +81,7 @@ def programs(
     inputs: Mapping[str, Tensor],
     outputs: Sequence[str],
 ) -> dict[str, Program]:
-    """Return the operations of a function by its name, after those of its repeated functions."""
+    """Return the operations of the repeated functions and of a function, by name."""
     with _set(_PARTS, {}) as parts, torch.no_grad():
         function(*inputs.values())
     result: dict[str, Program] = {}

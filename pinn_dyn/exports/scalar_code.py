@@ -1,4 +1,4 @@
-"""C functions of programs without loops: one statement for each number that is not known."""
+"""C functions for programs without loops, with a statement per number."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ _KNOWN: dict[str, Callable[..., float]] = {
     "neg": lambda a: -a,
     "logical_not": lambda a: not a,
 }
-"""Operations that are evaluated here if all operands are known."""
-_LONGEST = 80  # characters of an expression that is written into the one that uses it
+"""Operations that are evaluated during the export if all operands are known."""
+_LONGEST = 80  # longest expression that is written into another expression, in characters
 _MOST_WEIGHTS = 64  # learned numbers of a matrix, beyond which a loop is faster
 _MOST_WORK = 150_000  # operations with zeros, beyond which compilers take long
 
 Term = int
-"""Number of an entry of the list of terms."""
+"""Index of an entry in the list of terms."""
 
 
 class ScalarTerms:
-    """Numbers as operations on earlier numbers. Equal operations are the same term.
+    """Terms: operations on earlier terms. Equal operations are the same term.
 
-    Products with 0 and 1 and sums with 0 are not computed, which needs finite numbers.
+    Products with 0 or 1 and sums with 0 are simplified, which is exact for finite numbers.
     """
 
     def __init__(self) -> None:
@@ -55,13 +55,13 @@ class ScalarTerms:
         return number
 
     def known(self, value: float) -> Term:
-        """Return the term of a number that the code contains."""
+        """Return the term of a constant number in the code."""
         return self.term("known", value)
 
     def value(self, term: Term) -> float | None:
-        """Return the number of a term, or None if the code computes it."""
-        name, *rest = self.entries[term]
-        return rest[0] if name == "known" else None
+        """Return the number of a constant term, or None for any other term."""
+        name, *operands = self.entries[term]
+        return operands[0] if name == "known" else None
 
     def apply(self, name: str, *terms: Term) -> Term:
         """Return the term of an elementwise operation."""
@@ -72,34 +72,34 @@ class ScalarTerms:
         return self.term(name, *terms) if rule is None else rule(*terms)
 
     def _negated(self, term: Term) -> Term | None:
-        """Return x of a term -x."""
-        name, *rest = self.entries[term]
-        return rest[0] if name == "neg" else None
+        """Return x for a term -x, or None for any other term."""
+        name, *operands = self.entries[term]
+        return operands[0] if name == "neg" else None
 
     def _neg(self, a: Term) -> Term:
         inner = self._negated(a)
         return self.term("neg", a) if inner is None else inner
 
     def _mul(self, a: Term, b: Term) -> Term:
-        for x, other in ((a, b), (b, a)):
+        for x, y in ((a, b), (b, a)):
             if self.value(x) == 0:
                 return x
             if self.value(x) == 1:
-                return other
+                return y
             if self.value(x) == -1:
-                return self.apply("neg", other)
+                return self.apply("neg", y)
             inner = self._negated(x)
             if inner is not None:
-                return self.apply("neg", self.apply("mul", inner, other))
+                return self.apply("neg", self.apply("mul", inner, y))
         return self.term("mul", *sorted((a, b)))
 
     def _add(self, a: Term, b: Term) -> Term:
-        for x, other in ((a, b), (b, a)):
+        for x, y in ((a, b), (b, a)):
             if self.value(x) == 0:
-                return other
+                return y
             inner = self._negated(x)
             if inner is not None:
-                return self.apply("sub", other, inner)
+                return self.apply("sub", y, inner)
         return self.term("add", *sorted((a, b)))
 
     def _sub(self, a: Term, b: Term) -> Term:
@@ -116,21 +116,21 @@ class ScalarTerms:
         return self.term("div", a, b)
 
     def _where(self, mask: Term, a: Term, b: Term) -> Term:
-        if a == b:
+        value = self.value(mask)
+        if a == b or value:
             return a
-        known = self.value(mask)
-        return self.term("where", mask, a, b) if known is None else (a if known else b)
+        return self.term("where", mask, a, b) if value is None else b
 
     def _logical_and(self, a: Term, b: Term) -> Term:
-        for x, other in ((a, b), (b, a)):
+        for x, y in ((a, b), (b, a)):
             if self.value(x) is not None:
-                return other if self.value(x) else x
+                return y if self.value(x) else x
         return self.term("logical_and", a, b)
 
     def _logical_or(self, a: Term, b: Term) -> Term:
-        for x, other in ((a, b), (b, a)):
+        for x, y in ((a, b), (b, a)):
             if self.value(x) is not None:
-                return x if self.value(x) else other
+                return x if self.value(x) else y
         return self.term("logical_or", a, b)
 
     def _clone(self, a: Term) -> Term:
@@ -148,13 +148,13 @@ class ScalarTerms:
 
 
 class ScalarFunction:
-    """The body of a C function that evaluates a program number by number.
+    """Body of a C function that evaluates a program number by number.
 
-    Zeros of the structure cost nothing, and numbers that occur twice are computed once.
+    Operations with structural zeros are left out, and equal numbers are computed once.
 
     Args:
-        program: the operations; :func:`c_function` says for which programs this pays off.
-        constants: arrays of the file.
+        program: the operations. :func:`c_function` selects programs for which this pays off.
+        constants: constant arrays of the file.
 
     Attributes:
         lines: the statements.
@@ -199,8 +199,8 @@ class ScalarFunction:
         if name in MOVES.split():
             return self._moved(node)
         if name in ELEMENTWISE:
-            given = [self._operand(node, k) for k in range(len(node.args))]
-            return self._each(name, [x for x in given if x is not None], value.shape)
+            operands = [self._operand(node, k) for k in range(len(node.args))]
+            return self._each(name, [x for x in operands if x is not None], value.shape)
         if name in REDUCTIONS:
             return self._reduced(name, node)
         if name == "mm":
@@ -210,7 +210,7 @@ class ScalarFunction:
         raise unsupported(node, "C code")
 
     def _operand(self, node: fx.Node, k: int) -> np.ndarray | None:
-        """Return the terms of an operand, with true as 1 where a number is needed."""
+        """Return the terms of an operand, or None. A boolean in arithmetic becomes 0 or 1."""
         source = node.args[k]
         if isinstance(source, bool | int | float):
             return np.array(self._terms.known(float(source)))
@@ -219,8 +219,8 @@ class ScalarFunction:
         terms: np.ndarray = self._of[source]
         if not is_mask_as_number(node, k):
             return terms
-        one, zero = np.array(self._terms.known(1.0)), np.array(self._terms.known(0.0))
-        return self._each("where", [terms, one, zero], terms.shape)
+        numbers = [np.array(self._terms.known(x)) for x in (1.0, 0.0)]
+        return self._each("where", [terms, *numbers], terms.shape)
 
     def _each(self, name: str, operands: Sequence[np.ndarray], shape: Sequence[int]) -> np.ndarray:
         rows = [np.broadcast_to(x, shape).ravel().tolist() for x in operands]
@@ -238,13 +238,13 @@ class ScalarFunction:
     def _reduced(self, name: str, node: fx.Node) -> np.ndarray:
         (source, *_), value = node.all_input_nodes, node.meta["val"]
         terms = self._of[source]
-        given: Any = node.args[1] if len(node.args) > 1 else None
-        dims: Sequence[int] = given or range(terms.ndim)
+        argument: Any = node.args[1] if len(node.args) > 1 else None
+        dims: Sequence[int] = argument or range(terms.ndim)
         axes = sorted(d % terms.ndim for d in dims)
-        kept = np.moveaxis(terms, axes, range(len(axes))).reshape(-1, value.numel())
+        rows = np.moveaxis(terms, axes, range(len(axes))).reshape(-1, value.numel())
         step = {"sum": "add", "amin": "minimum", "amax": "maximum"}[name]
-        total = kept[0] if len(kept) else np.full(value.numel(), self._terms.known(0.0))
-        for row in kept[1:]:
+        total = rows[0] if len(rows) else np.full(value.numel(), self._terms.known(0.0))
+        for row in rows[1:]:
             total = self._each(step, [total, row], total.shape)
         return total.reshape(value.shape)
 
@@ -256,8 +256,8 @@ class ScalarFunction:
         return total
 
     def _called(self, node: fx.Node) -> np.ndarray:
-        given: Any = node.args
-        function, *sources, size = given
+        node_arguments: Any = node.args
+        function, *sources, size = node_arguments
         arguments = tuple(tuple(self._of[x].ravel().tolist()) for x in sources)
         call = self._terms.term("call", function, arguments, len(sources[1].meta["val"]), size)
         return np.array([self._terms.term("element", call, k) for k in range(size)], dtype=int)
@@ -268,16 +268,16 @@ class ScalarFunction:
         entries = self._terms.entries
         uses = [0] * len(entries)
         for term in itertools.chain(*ends):
-            uses[term] += 2  # it gets a variable, since inputs and outputs may overlap
+            uses[term] += 2  # a result gets a variable, since inputs and outputs may overlap
         for term in reversed(range(len(entries))):
             for operand in _operands(entries[term]) if uses[term] else ():
                 uses[operand] += 1
         results = set(itertools.chain(*ends))
-        for term, (name, *rest) in enumerate(entries):
+        for term, (name, *operands) in enumerate(entries):
             if not uses[term]:
                 continue
             if name == "call":
-                self._write_call(term, *rest)
+                self._write_call(term, *operands)
             else:
                 self._texts[term] = self._written(term, uses[term] > 1, term in results)
         for name, terms in zip(names, ends, strict=True):
@@ -285,16 +285,16 @@ class ScalarFunction:
             self.lines += [f"{name}[{k}] = {value};" for k, value in enumerate(values)]
 
     def _written(self, term: Term, is_shared: bool, is_result: bool) -> str:
-        """Return the expression of a term as an operand, after a statement for it if it is long."""
-        name, *rest = self._terms.entries[term]
+        """Return a term as an operand. Write a statement with a variable for a long expression."""
+        name, *operands = self._terms.entries[term]
         if name == "known":
-            return self._constants.number(rest[0])
+            return self._constants.number(operands[0])
         if name == "element":
-            return f"{self._texts[rest[0]]}[{rest[1]}]"
+            return f"{self._texts[operands[0]]}[{operands[1]}]"
         if name == "leaf":
-            text, is_operand = rest[0], not is_result
+            text, is_operand = operands[0], not is_result
         else:
-            text = ELEMENTWISE[name].format(*(self._texts[x] for x in rest))
+            text = ELEMENTWISE[name].format(*(self._texts[x] for x in operands))
             is_operand = not is_shared and len(text) <= _LONGEST
         if not is_operand:
             kind = "flag" if name in _MASKS else "real"
@@ -337,37 +337,36 @@ _MASKS = {"gt", "ge", "lt", "le", "eq", "logical_and", "logical_or", "logical_no
 
 
 def _operands(entry: tuple[Any, ...]) -> Sequence[Term]:
-    name, *rest = entry
+    name, *operands = entry
     if name in ("leaf", "known"):
         return ()
     if name == "element":
-        return rest[:1]
-    return [*itertools.chain(*rest[1])] if name == "call" else rest
+        return operands[:1]
+    return [*itertools.chain(*operands[1])] if name == "call" else operands
 
 
 def _most_live(lines: Sequence[str]) -> int:
-    """Return the largest number of numbers that are needed later, in the order of the lines."""
+    """Return the largest count of numbers that are live, over all lines."""
     last = {name: k for k, line in enumerate(lines) for name in _VARIABLE.findall(line)}
-    live, most, ends = 0, 0, collections.Counter(last.values())
+    live, peak, ends = 0, 0, collections.Counter(last.values())
     seen: set[str] = set()
     for k, line in enumerate(lines):
         new = set(_VARIABLE.findall(line)) - seen
         seen |= new
         array = _ARRAY.match(line)
         live += int(array[1]) if array else len(new)
-        most = max(most, live)
+        peak = max(peak, live)
         live -= ends[k]
-    return most
+    return peak
 
 
 CBody = CFunction | ScalarFunction
 
 
 def c_function(program: Program, constants: ConstantArrays) -> CBody:
-    """Return a function without loops if the program has no large matrix of learned numbers."""
-    return (
-        ScalarFunction(program, constants) if _is_scalar(program) else CFunction(program, constants)
-    )
+    """Return a C function, without loops if the program has no large matrix of learned numbers."""
+    kind = ScalarFunction if _is_scalar(program) else CFunction
+    return kind(program, constants)
 
 
 def _is_scalar(program: Program) -> bool:

@@ -1,4 +1,4 @@
-"""Numbers and attributes that functions of a model read, and whether they have changed."""
+"""Detect changes of the numbers and attributes that functions of a model read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 _LIBRARIES = sys.stdlib_module_names | {"pinn_dyn", "torch", "numpy", "scipy", "builtins"}
-"""Packages whose functions and classes stay as they are."""
+"""Packages whose functions and classes do not change."""
 _PLAIN = (type(None), bool, int, float, complex, str, bytes)
 _MODULE = frozenset(vars(nn.Module())) - {"_parameters", "_buffers", "_modules"}
 _MEMBERS = {
@@ -29,16 +29,17 @@ _CLASS = {"__dict__", "__weakref__", "__doc__", "__module__", "_abc_impl", "__an
 
 
 class Watch:
-    """All that functions of some objects read, found by following attributes and code.
+    """Record of all values that functions of some objects read.
 
-    It follows attributes, containers and submodules, and of classes and functions of the user also
-    their code, default values, closures and global names. Classes of libraries stay as they are.
+    The record follows attributes, containers and submodules. For classes and functions of the user,
+    it includes their code, default values, closures and global names. Classes of libraries are
+    assumed not to change.
 
     Args:
         roots: models, other objects, classes or functions.
 
     Attributes:
-        tensors: the tensors, in the order in which they were found.
+        tensors: the tensors, in the order of the search.
     """
 
     def __init__(self, *roots: Any):
@@ -52,12 +53,12 @@ class Watch:
         self._seen.clear()
 
     def changed(self) -> bool:
-        """Return true if a number, an attribute or a function is not that of the start."""
+        """Return true if a number, an attribute or a function has changed since the start."""
         try:
             for container, size, read, before in self._parts:
                 if len(container) != size or not all(map(is_, read(container), before)):
                     return True
-        except KeyError:  # of an attribute that is gone
+        except KeyError:  # an attribute was deleted
             return True
         for tensor, address, view, content in self._arrays:
             if tensor is not None and tensor.data_ptr() != address:
@@ -67,20 +68,20 @@ class Watch:
         return False
 
     def digest(self) -> str:
-        """Return the SHA-256 of all but the numbers in tensors.
+        """Return the SHA-256 of all values except the numbers in tensors.
 
-        The zeros and ones of a tensor belong to the digest, since code may do without them.
+        Zeros and ones of tensors are included, since code may leave out operations with them.
         """
         return hashlib.sha256(repr([_package(), *self._words]).encode()).hexdigest()
 
     def _visit(self, value: Any) -> None:
-        """Follow a value, and describe it."""
+        """Record a value and all values that it refers to."""
         if isinstance(value, _PLAIN):
             self._words.append(value)
         elif id(value) in self._seen:
             self._words.append(f"see {self._seen[id(value)][0]}")
         else:
-            self._seen[id(value)] = len(self._seen), value  # an address names a living object
+            self._seen[id(value)] = len(self._seen), value  # keeps the object and its address alive
             self._follow(value)
 
     def _follow(self, value: Any) -> None:
@@ -122,7 +123,7 @@ class Watch:
             self._visit(item)
 
     def _part(self, mapping: Mapping[str, Any], keys: Iterable[str]) -> None:
-        """Watch the number of items of a mapping, and which objects the values of keys are."""
+        """Watch the number of items of a mapping, and the identity of the values of ``keys``."""
         names = [*keys]
         single = len(names) == 1
         read = itemgetter(*names, *names[:single]) if names else lambda _: ()
@@ -181,15 +182,14 @@ class Watch:
             self._visit(_content(cell))
 
     def _names(self, function: types.FunctionType) -> None:
-        """Follow the global names that a function of the user reads, also in modules."""
+        """Record the global names that a function of the user reads, also in modules."""
         names = {*_names_in(function.__code__)}
         spaces = [function.__globals__]
-        for space in spaces:  # grows meanwhile
-            known = sorted(names & space.keys())
-            self._parts.append(
-                (known, len(known), partial(_looked_up, space), [space[x] for x in known])
-            )
-            for name in known:
+        for space in spaces:  # modules are appended during the iteration
+            present = sorted(names & space.keys())
+            values = [space[name] for name in present]
+            self._parts.append((present, len(present), partial(_looked_up, space), values))
+            for name in present:
                 item = space[name]
                 if not isinstance(item, types.ModuleType):
                     self._words.append(name)
@@ -200,7 +200,7 @@ class Watch:
 
 @functools.cache
 def _is_library(module: str | None) -> bool:
-    """Return true for a module whose functions stay as they are: of Python, or installed."""
+    """Return true for a module of Python or of an installed package, assumed not to change."""
     package = str(module).partition(".")[0]
     file = getattr(sys.modules.get(package), "__file__", None) or ""
     return module is None or package in _LIBRARIES or "site-packages" in Path(file).parts
@@ -222,7 +222,7 @@ def _inner(code: types.CodeType) -> list[types.CodeType]:
 
 
 def _instructions(code: types.CodeType) -> Any:
-    """Return what a function does, without its comments and the names of files and lines."""
+    """Return the instructions of a function, without comments and names of files and lines."""
     numbers = [x for x in code.co_consts if not isinstance(x, types.CodeType)]
     return code.co_code, code.co_names, repr(numbers), [*map(_instructions, _inner(code))]
 
@@ -233,7 +233,7 @@ def _names_in(code: types.CodeType) -> list[str]:
 
 @functools.cache
 def _package() -> str:
-    """Return a digest of the sizes and times of the files of this package, and of PyTorch."""
+    """Return a digest of the versions of this package (sizes and times of files) and PyTorch."""
     files = sorted(Path(__file__).parents[1].rglob("*.py"))
     states = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     return hashlib.sha256(repr([torch.__version__, *states]).encode()).hexdigest()

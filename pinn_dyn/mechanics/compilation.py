@@ -97,7 +97,7 @@ def compile_graph(
 
     _keep_rows()
     graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
-    for node in graph.graph.nodes:  # the recorded shapes do not fit; use those of the arguments
+    for node in graph.graph.nodes:  # drop the recorded shapes, in favor of those of the arguments
         node.meta.clear()
     _share_constants(graph)
     if arguments[0].is_cuda:

@@ -97,9 +97,7 @@ class MechanicalTerms(ContinuousPredictor):
     def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force of the inputs and the residual force, ``(*batch, N)``."""
         force = self.input_force(q, u)
-        if self.has_residual:
-            force = force + self._residual_force(q, v, u)
-        return force
+        return force + self._residual_force(q, v, u) if self.has_residual else force
 
     def reachable_force(self, q: Tensor, v: Tensor, tau: Tensor) -> Tensor:
         """Return the force closest to tau that the drives can exert, ``(*batch, N)``."""

@@ -52,7 +52,7 @@ def path_between(
     dynamics: Dynamics, integrator: Integrator, x0: Tensor, t: Tensor, input: Signal
 ) -> Tensor:
     """Return increments x(t_k) - x(t_0), ``(*batch, T, S)``, without the checks of a rollout."""
-    # Times are relative before they are cast, so that those of solver and input compare exactly.
+    # Subtract t[0] before the cast, so that times of the solver and the input compare exactly.
     input = input.since(t[0])
     grid = step_grid(t - t[0], input.t.detach(), integrator.substeps).to(x0.dtype)
     path = integrator.path(dynamics, x0, grid, input.to(x0.device, x0.dtype))

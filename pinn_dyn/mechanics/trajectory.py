@@ -207,7 +207,7 @@ def samples_of(name: str, duration: float, t: Tensor) -> int:
     count = round(duration / sample_time)
     if count < 1 or abs(duration / sample_time - count) > 1e-3:
         raise ValueError(
-            f"{name} is {duration} s, but the sample time of the data is {sample_time:g} s: "
+            f"{name} is {duration} s and the sample time of the data is {sample_time:g} s: "
             f"{name} must be a positive integer multiple of the sample time"
         )
     return count

@@ -65,7 +65,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         self.inverse_mass = inverse_mass(self._scales(statistics, inverse_mass_scale.sqrt()))
         if self.inverse_mass.transposed:
             raise ValueError(
-                "M^-1 = L L^T suits chains already: set model.inverse_mass.transposed=false"
+                "M^-1 = L L^T already suits chains: set model.inverse_mass.transposed=false"
             )
 
     def inverse_mass_matrix(self, q: Tensor) -> Tensor:

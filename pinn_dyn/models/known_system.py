@@ -61,8 +61,8 @@ class KnownSystem(LearnedConstants):
         if (statistics.num_coordinates, statistics.num_inputs) != (size, inputs):
             raise ValueError(
                 f"the data have {statistics.num_coordinates} coordinates and "
-                f"{statistics.num_inputs} inputs, the structure {type(structure).__name__} has "
-                f"{size} and {inputs}"
+                f"{statistics.num_inputs} inputs, but {type(structure).__name__} has {size} "
+                f"coordinates and {inputs} inputs"
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()

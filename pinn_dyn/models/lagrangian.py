@@ -59,8 +59,8 @@ class LagrangianNetwork(structured.StructuredNetwork):
         self.mass = mass(self._scales(statistics, inertia.sqrt()))
         if self.mass.chain and not self.mass.transposed:
             raise ValueError(
-                "model.mass.chain is true, but columns of L depend on later joints alone only in "
-                "M = L^T L: set model.mass.transposed=true"
+                "model.mass.chain is true, which is correct for M = L^T L, but not for M = L L^T: "
+                "set model.mass.transposed=true"
             )
         scales = self._scales(statistics, statistics.v_std)
         self.initial_velocity = initial_velocity and initial_velocity(scales)

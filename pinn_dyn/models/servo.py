@@ -70,7 +70,7 @@ class Servo(Drives):
         if inputs not in (len(index), 2 * len(index)):
             raise ValueError(
                 f"the data have {inputs} inputs, expected targets of {len(index)} joints, or "
-                "targets and then feed-forward forces: correct "
+                "targets followed by feed-forward forces: correct "
                 f"{wording.setting('dataset.u.columns')}, or "
                 f"{wording.setting('model.input.joints')}"
             )

@@ -47,7 +47,8 @@ def inertial_parameters(pseudo: Tensor) -> Tensor:
 def rod(start: Tensor, end: Tensor, *, radius: float, density: float) -> Tensor:
     """Return J of a homogeneous cylinder from ``start`` to ``end``, ``(3,)`` each in m.
 
-    With l its length and d its direction, S = m (c c^T + l^2 d d^T / 12 + r^2 (1 - d d^T) / 4).
+    With the length l, the radius r and the direction d, its second moments are
+    S = m (c c^T + l^2 d d^T / 12 + r^2 (1 - d d^T) / 4).
     """
     along = end - start
     length = along.norm()

@@ -171,9 +171,9 @@ def _joint(
 def _inertial(model: Any, data: Any, body: int, origin: np.ndarray) -> str:
     axes = data.ximat[body].reshape(3, 3)
     moments = axes * model.body_inertia[body] @ axes.T
-    upper = moments[np.triu_indices(3)]
     keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    text = " ".join(f'{key}="{moment}"' for key, moment in zip(keys, upper, strict=True))
+    pairs = zip(keys, moments[np.triu_indices(3)], strict=True)
+    text = " ".join(f'{key}="{moment}"' for key, moment in pairs)
     return (
         f'<inertial><mass value="{model.body_mass[body]}"/><inertia {text}/>'
         f'<origin xyz="{exact_text(data.xipos[body] - origin)}"/></inertial>'

@@ -305,7 +305,7 @@ class RigidChain(MechanicalSystem):
         return self._of_coordinates(by_q), self._of_coordinates(by_v)
 
     def parameters_of(self, inertia: Tensor | None = None) -> Tensor:
-        """Return the ten inertial parameters of each body, ``(B, 10)``: kg, kg m, kg m^2."""
+        """Return the ten inertial parameters of each body, ``(B, 10)``, see :meth:`regressor`."""
         return inertial_parameters(self.inertia if inertia is None else inertia)
 
     def _ends(self) -> list[Tensor | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import math
 import re
 import shlex
@@ -68,8 +69,7 @@ class UrdfFile:
         self.roots = [name for name in self.links if name not in children]
         self.order: list[str] = []
         if not shared:
-            for root in self.roots:
-                self.order += self._descendants(root)
+            self.order = list(itertools.chain.from_iterable(map(self._descendants, self.roots)))
             reached = {self.ends[name][1] for name in self.order}
             if circle := sorted(children.keys() - reached):
                 mistakes.append(f"no joints lead from a base to the links {circle}")

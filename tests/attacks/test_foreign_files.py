@@ -68,5 +68,5 @@ def test_a_checkpoint_is_a_regular_file(tmp_path, lnn_run):
 
 def test_stored_trajectories_are_a_regular_file(tmp_path):
     as_pipe(tmp_path / "trajectories.pt")
-    with pytest.raises(ValueError, match="no regular file"):
+    with pytest.raises(ValueError, match="not a regular file"):
         StoredSource(str(tmp_path / "trajectories.pt"), "x", ["q"], ["u"]).load()

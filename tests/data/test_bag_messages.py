@@ -149,7 +149,9 @@ def test_numbers_of_joints_that_change_their_order_are_refused(tmp_path):
         q = np.ascontiguousarray(Q[k, ::-1])
         items[k] = (T[k, 0], joint_state(k, names=JOINTS[::-1], q=q))
     write(tmp_path / "bag", items)
-    with pytest.raises(LogError, match=r"is of j1, j2 by turns: write /joint_states/position/j1"):
+    with pytest.raises(
+        LogError, match=r"belongs to j1, j2 by turns: write /joint_states/position/j1"
+    ):
         read(tmp_path / "bag", [f"{STATES}/position/0"])
     table = read(tmp_path / "bag", COLUMNS[:2])
     np.testing.assert_allclose(table.frame[COLUMNS[:2]], Q)

@@ -100,7 +100,7 @@ BAD = {
     "jitter": (clock(lambda t: t + 0.004 * np.sin(40 * t)), r"needs a uniform clock.*Resample"),
     "bursts": (in_bursts(), r"line 3, column 't': .* repeats .*RowClock.rate=.*, longest="),
     "empty": (motion()[:0], r"has no rows"),
-    "short": (motion(2.0), r"too short to keep 2.0 s for test"),
+    "short": (motion(2.0), r"too short for 2.0 s of test"),
     "wraps": (wrapped(2 * np.pi), r"run.csv, line \d+, column 'q2' \(q\): the angle wraps from"),
     "mixture": (alternating(motion(), motion(phase=2.0)), r"line 3, .*rows go to and fro"),
     "dates": (motion().assign(t="noon"), "line 2, column 't' .*expected a number, or a date"),
@@ -202,7 +202,7 @@ def test_two_runs_of_equal_times_are_not_deduplicated_away(tmp_path):
 def test_a_run_of_another_sample_time_is_named(tmp_path):
     for name, table in zip("abc", (motion(), motion(), motion(rate=50)), strict=True):
         write(tmp_path, table, f"{name}.csv")
-    message = r"c .*its sample time is 0.02 s, that of the other .* 0.01 s: .*Resample"
+    message = r"c .*the sample time is 0.02 s, but that of other .* 0.01 s: .*Resample"
     with pytest.raises(LogError, match=message):
         source(tmp_path, validation=dict(seconds=1.0, piece=1.0)).load()
 
@@ -214,7 +214,7 @@ def test_files_that_are_not_there_and_runs_of_one_name(tmp_path):
     with pytest.raises(LogError, match="absent', which is no folder"):
         source(tmp_path / "absent").load()
     write(tmp_path, motion(), "b.txt")
-    with pytest.raises(LogError, match=r"are both the run 'b'"):
+    with pytest.raises(LogError, match=r"both have the run name 'b'"):
         source(tmp_path, files=["*.csv", "*.txt"]).load()
 
 

@@ -279,7 +279,7 @@ def test_short_stretches_are_dropped_and_named(folder):
         (dict(test=dict(piece=1.0)), r"test: expected either runs or seconds"),
         (dict(test=dict(run=1, piece=2.0)), r"test.run: Unexpected"),
         (dict(test=None), r"both validation and test"),
-        (dict(angles=[2]), r"angles is \[2\], expected numbers of angles"),
+        (dict(angles=[2]), r"angles is \[2\], expected indices"),
     ],
 )
 def test_wrong_descriptions_are_refused(tmp_path, changes, message):

@@ -267,5 +267,5 @@ def test_impossible_settings_are_refused(step):
 
 
 def test_a_velocity_is_not_derived_twice():
-    with pytest.raises(LogError, match="has a velocity already"):
+    with pytest.raises(LogError, match="already has a velocity"):
         SavitzkyGolayVelocity().apply(recording(NOISE, v=NOISE))

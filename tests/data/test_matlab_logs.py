@@ -179,8 +179,11 @@ def test_times_or_states_at_both_ends_of_the_steps(tmp_path, longer):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (dict(u=U + 1j), r"'u_1' is of complex128 \(601, 2\).*q \(601, 2\)"),
-        (dict(u=U[::10]), r"'u_1' is of float64 \(61, 2\), expected real numbers in 601 rows"),
+        (dict(u=U + 1j), r"'u_1' has type complex128 and shape \(601, 2\).*q \(601, 2\)"),
+        (
+            dict(u=U[::10]),
+            r"'u_1' has type float64 and shape \(61, 2\), expected real numbers in 601 rows",
+        ),
         (dict(t=np.empty(0), fs=100.0), r"no variable 't'.*write time=\{'rate': 100.0\}.*fs = 100"),
         (dict(t=np.empty(0), Ts=0.01, Generate=1.0), r"no variable 't'.*rate': 100\}.*Ts = 0.01"),
     ],

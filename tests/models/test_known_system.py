@@ -115,8 +115,11 @@ class Unmeasured(SoftArm):
         (RigidChain(TREE, locked_joints=["wrist", "turn"]), "RigidChain has the constants"),
         (Unmeasured(), "Unmeasured has the constants .*stiffness.*expected a unit for each entry"),
         (SoftArm(stiffness=0.0), r"stiffness 1: start is .* expected positive"),
-        (SoftArm(2), "the data have 3 coordinates and 3 inputs, the structure SoftArm has 6 and 6"),
-        (CartPole(), "the structure CartPole has 2 and 1"),
+        (
+            SoftArm(2),
+            "the data have 3 coordinates and 3 inputs, but SoftArm has 6 coordinates",
+        ),
+        (CartPole(), "but CartPole has 2 coordinates and 1 inputs"),
     ],
 )
 def test_a_structure_that_cannot_be_learned_is_refused_by_name(structure, message):

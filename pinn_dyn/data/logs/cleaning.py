@@ -1,4 +1,4 @@
-"""Cleaning of the stretches of a log by its steps."""
+"""Cleaning of the stretches of a log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def clean(
     report: Report,
     limits: Mapping[str, float] | None = None,
 ) -> list[Cleaned]:
-    """Apply the steps, and derive a missing velocity; drop stretches below ``limits``, s."""
+    """Apply the steps and derive a missing velocity. Drop stretches shorter than ``limits``, s."""
     for name, step in steps.items():
         cleaned = _apply(name, step, cleaned, report)
         if limits is not None:
@@ -31,13 +31,13 @@ def clean(
 def long_enough(
     name: str, cleaned: list[Cleaned], limits: Mapping[str, float], report: Report
 ) -> list[Cleaned]:
-    """Drop the stretches that a step left shorter than the limit of their split, s."""
+    """Drop stretches that are shorter than the limit of their split, s, after a step."""
     result = []
     for part in cleaned:
         limit = limits[part.split]
         clean = []
         for item in part.clean:
-            # Half a sample: times are rounded.
+            # Tolerate half a sample, since times are rounded.
             if len(item) > 1 and item.duration >= limit - 0.5 * (item.t[1] - item.t[0]):
                 clean.append(item)
                 continue
@@ -58,7 +58,7 @@ def _apply(name: str, step: Step, cleaned: Sequence[Cleaned], report: Report) ->
         for recording in part.clean:
             try:
                 stretches, text = step.apply(recording)
-            except ValueError as error:  # also of SciPy, as of too few samples
+            except ValueError as error:  # LogError, or an error of SciPy, as for too few samples
                 raise LogError(f"{recording.place}, step {name}: {error}") from error
             report.add(f"{name}: {step}", f"{part.split} {recording.place}", text)
             clean += stretches

@@ -13,15 +13,16 @@ from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.recording import SIGNALS, Recording
 from pinn_dyn.data.logs.step import Step
 
-_ROUNDING = 1e-3  # of a sample time
+_ROUNDING = 1e-3  # rounding of times, in sample times
 
 
 @dataclass(frozen=True)
 class Deduplicate(Step):
-    """Drop rows with the time of the row before, and rows that repeat all its values.
+    """Drop rows that repeat the time, or all values, of the previous row.
 
     Args:
-        longest: longest series of repeats that counts as stale; a longer one is a robot at rest.
+        longest: longest series of repeated values that is dropped. In a longer series, the robot is
+            at rest.
     """
 
     longest: PositiveInt = 5
@@ -47,7 +48,7 @@ class SplitGaps(Step):
     """Split a run where the time jumps by more than ``longest``, or backwards.
 
     Args:
-        longest: longest step of the time that is no gap, s.
+        longest: longest time between two rows without a split, s.
     """
 
     longest: PositiveFloat
@@ -69,7 +70,7 @@ class Resample(Step):
 
     Args:
         rate: samples per second, Hz.
-        max_gap: longest time between two rows that is interpolated, s.
+        max_gap: longest time between two rows for an interpolation, s.
     """
 
     rate: PositiveFloat
@@ -89,7 +90,7 @@ class Resample(Step):
                 f"{recording.place}: Resample found a gap of {spacing[widest]:.4g} s after t = "
                 f"{t[widest]:.6g} s: put SplitGaps before it, or raise max_gap, {self.max_gap} s"
             )
-        # The last sample may round to just beyond the end.
+        # Rounding may put the last sample just beyond the end.
         count = int(np.floor((t[-1] - t[0]) * self.rate + 1e-6)) + 1
         clock = t[0] + np.arange(count) / self.rate
 
@@ -107,12 +108,12 @@ class Resample(Step):
 class InputDelay(Step):
     """Shift each input to the time at which it acts: u_i(t) becomes u_i(t - d_i).
 
-    Between two samples u is interpolated linearly. For an input that is held between its samples,
+    Between two samples, u is interpolated linearly. For an input that is held between its samples,
     the result is the mean of u(t - d) over each sample. The first max(d) s are dropped.
 
     Args:
-        delay: d, s; one, or one per input. Rates that InputRates has appended have the delays of
-            their inputs.
+        delay: d, s, one number, or one per input. Rates that :class:`InputRates` has appended have
+            the delays of their inputs.
     """
 
     delay: NonNegativeFloat | Sequence[NonNegativeFloat]
@@ -123,9 +124,11 @@ class InputDelay(Step):
             raise LogError(f"delay has {len(delays)} entries, expected 1 or {inputs}")
         pairs = zip(np.resize(delays, inputs), recording.u.T, strict=True)
         u = [np.interp(t - d, t, x) for d, x in pairs]
-        # Times are rounded.
-        kept = t >= t[0] + delays.max() - _ROUNDING * np.median(np.diff(t))
-        if kept.sum() < 2:
-            raise LogError(f"{recording.place}: shorter than the input delay: drop the run")
-        shifted = replace(recording, u=np.column_stack(u)).rows(kept)
+        start = t[0] + delays.max() - _ROUNDING * np.median(np.diff(t))
+        has_input = t >= start
+        if has_input.sum() < 2:
+            raise LogError(
+                f"{recording.place}: the run is shorter than the input delay: drop the run"
+            )
+        shifted = replace(recording, u=np.column_stack(u)).rows(has_input)
         return [shifted], f"u delayed by {listed(f'{d:.4g} s' for d in dict.fromkeys(delays))}"

@@ -36,7 +36,7 @@ _FACTORS: dict[str, dict[str, float]] = {
 UNITS: dict[str, tuple[str, float]] = {
     unit: (si, factor) for si, units in _FACTORS.items() for unit, factor in units.items()
 }
-"""SI unit of each unit, and the factor to it: x_SI = factor * x."""
+"""SI unit of each unit, and the factor of the conversion: x_SI = factor * x."""
 
 
 _SPELLINGS = {
@@ -47,18 +47,18 @@ _SPELLINGS = {
     "rps": "rev/s",
     **{"µs": "us", "μs": "us", "µm": "um", "μm": "um", "-": "1"},
 }
-"""Spellings of the parts of units in files."""
+"""Names of the parts of units, by their spellings in files."""
 
 
 def known_unit(text: str) -> str | None:
-    """Return the name of a unit that a file spells in its way, as ``[°/sec]``, or None."""
+    """Return the name of a unit from its spelling in a file, such as ``[°/sec]``, or None."""
     parts = re.sub(r"[][(){}\s·*⋅.]|(?<=N)-", "", text).split("/")
     unit = "/".join(_SPELLINGS.get(part.lower(), part) for part in parts)
     return unit if unit in UNITS else None
 
 
 def to_si(unit: str) -> tuple[str, float]:
-    """Return the SI unit of a unit, and the factor to it."""
+    """Return the SI unit of a unit, and the factor of the conversion."""
     name = known_unit(unit)
     if name is None:
         hint = did_you_mean(unit, UNITS) or "."
@@ -72,10 +72,10 @@ _Kind = TypeVar("_Kind")
 
 
 def validated(kind: type[_Kind], name: str, value: _Kind | Mapping[str, Any]) -> Any:
-    """Return an object of a class, built from a mapping of its arguments if need be.
+    """Return an object of a class; build it from a mapping of its arguments if necessary.
 
     Raises:
-        LogError: naming each argument of ``name`` that is missing, unknown or wrong.
+        LogError: if an argument is missing, unknown or wrong. The message lists all mistakes.
     """
     try:
         return TypeAdapter(kind).validate_python(value)
@@ -85,7 +85,7 @@ def validated(kind: type[_Kind], name: str, value: _Kind | Mapping[str, Any]) ->
 
 
 def _differences(names: Sequence[str]) -> list[str]:
-    """Return names without their common beginning and end."""
+    """Return names without their common prefix and suffix."""
     first = len(os.path.commonprefix(names))  # noqa: RUF071
     end = len(os.path.commonprefix([x[first:][::-1] for x in names]))  # noqa: RUF071
     return [x[first : len(x) - end] for x in names]
@@ -100,13 +100,13 @@ class Columns:
 
         x = sign * scale * factor(unit) * (raw - offset)
 
-    All but ``columns`` is one value, or one per column.
+    Each argument except ``columns`` is a single value, or one value per column.
 
     Args:
         columns: names of the columns in the file.
         unit: unit in the file, see :data:`~pinn_dyn.data.logs.UNITS`.
         sign: 1 or -1.
-        scale: factor beside that of the unit, such as a gear ratio.
+        scale: additional factor, such as a gear ratio.
         offset: value at x = 0, in the unit of the file.
     """
 
@@ -130,7 +130,7 @@ class Columns:
 
     @property
     def labels(self) -> list[str]:
-        """Name and SI unit of each column, as in ``q1 [rad]``."""
+        """Name and SI unit of each column, such as ``q1 [rad]``."""
         return [
             name if unit == "1" else f"{name} [{unit}]"
             for name, unit in zip(self.columns, self.units, strict=True)
@@ -147,30 +147,33 @@ class Columns:
         return values / self.factors + self.offset
 
     def check_units(self, signal: str, expected: Sequence[str]) -> None:
-        """Raise a LogError unless all SI units are among the expected ones."""
+        """Raise a LogError if an SI unit is not among the expected units."""
         for column, unit in zip(self.columns, self.units, strict=True):
             if unit not in expected:
                 raise LogError(f"{signal} has the column {column!r} in {unit}, expected {expected}")
 
     def in_order_of(self, columns: Sequence[str]) -> Columns:
-        """Return the columns in the order of others, whose names differ alike: ``dq2`` and ``q2``.
+        """Return the columns in the order of other columns with matching names.
 
-        Numbers of columns have no order.
+        The names match if they differ among each other in the same way: ``dq1``, ``dq2`` and
+        ``q1``, ``q2``. Columns without matching names, or named by numbers, keep their order.
         """
         names, order = _differences(self.columns), _differences(columns)
         if sorted(names) != sorted(order) or all(x.isdigit() for x in columns):
             return self
-        places = [names.index(x) for x in order]
-        keys = ("columns", "unit", "sign", "scale", "offset")
-        return replace(self, **{key: [getattr(self, key)[k] for k in places] for key in keys})
+        ordered = {}
+        for key in ("columns", "unit", "sign", "scale", "offset"):
+            values = dict(zip(names, getattr(self, key), strict=True))
+            ordered[key] = [values[x] for x in order]
+        return replace(self, **ordered)
 
     def contradictions(self, signal: str, units: Mapping[str, str]) -> list[str]:
-        """Return a sentence for each column whose unit in the file, as in ``units``, differs."""
+        """Return a sentence for each column whose unit differs from that of the file, ``units``."""
         texts = []
         for column, unit, factor in zip(self.columns, self.unit, self.factors, strict=True):
             name = known_unit(units.get(column, "")) or unit
             si, usual = to_si(name)
-            # A factor may be a part of the scale.
+            # The conversion may be a part of ``scale``.
             differs = si == to_si(unit)[0] and usual != to_si(unit)[1]
             if differs and not math.isclose(abs(factor), usual):
                 texts.append(

@@ -1,4 +1,4 @@
-"""Empty cells of signals with slower clocks, such as of joined topics."""
+"""Fill empty cells of signals with slower clocks, such as those of joined topics."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ def fill(
 ) -> np.ndarray:
     """Fill the empty cells of a run in place: hold u, interpolate q and v linearly.
 
-    Rows between two samples of the first column of q are dropped. No cell is filled
-    between two values that are further apart than ``max_age``, s, and three usual sample times of
-    the column. Rows with such cells are dropped too.
+    Rows between two samples of the first column of q are dropped. A cell stays empty if its
+    neighboring values are further apart than both ``max_age``, s, and three usual sample times of
+    the column. Rows with empty cells are dropped, too.
 
     Args:
         recording: rows in the order of their times, with NaN in empty cells.
         signals: columns of each signal.
-        table: the rows, for messages.
+        table: the same rows as a table, for messages.
         max_age: see above, s.
-        report: gets notes and warnings.
-        splits: a later step splits runs where rows are missing.
+        report: report that gets notes and warnings.
+        splits: true if a later step splits runs where rows are missing.
 
     Returns:
-        The rows that stay, a mask ``(T,)``.
+        Mask ``(T,)`` of the rows that are not dropped.
 
     Raises:
-        LogError: if a column has no value, no row stays, or rows are missing in the middle of a
-            run that no step splits there.
+        LogError: if a column has no value, all rows are dropped, or rows are dropped in the middle
+            of a run and ``splits`` is false.
     """
     t, run = recording.t, recording.run
     clock = ~np.isnan(recording.q[:, 0])
-    if len(times := t[clock]) > 1:  # rows between samples of q are of other signals
+    if len(times := t[clock]) > 1:  # rows between samples of q belong to other signals
         age, _ = _filled(times, times, t, hold=False)
         clock |= np.isfinite(age) & (age > _LOST * np.median(np.diff(times)))
     stays = clock.copy()
@@ -87,7 +87,9 @@ def fill(
             else:
                 report.warn("empty cells", f"{table.name}: {text}")
     if not stays.any():
-        raise LogError(f"{table.name}: no row has values of {', '.join(signals)}, on one clock")
+        raise LogError(
+            f"{table.name}: no row has values of {', '.join(signals)}: do they have the same clock?"
+        )
     if dropped := int((clock & ~stays).sum()):
         report.add("Read", run, f"{dropped} of {clock.sum()} rows lack a value and are dropped")
     return stays
@@ -96,11 +98,11 @@ def fill(
 def _filled(
     times: np.ndarray, x: np.ndarray, at: np.ndarray, *, hold: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances of the values before and after some times, s, and the values there."""
+    """Return the time between the neighboring values of each time, s, and the filled values."""
     last = np.searchsorted(times, at, side="right") - 1
     following = np.searchsorted(times, at)
     age = np.where(last < 0, np.inf, np.r_[times, np.inf][following] - times[last])
     if not hold:
         return age, np.interp(at, times, x)
-    # A value is held beyond the end of its signal, too.
+    # The last value of a signal is held, too.
     return np.where(following < len(times), age, at - times[last]), x[last]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,7 @@ from pinn_dyn.data.logs.step import Signals, Step, window_samples
 
 @dataclass(frozen=True)
 class MovingAverage(Step):
-    """Average ``window`` samples around each sample, fewer at the ends, as MATLAB's ``movmean``.
+    """Average ``window`` samples around each sample, fewer at the ends, like MATLAB's ``movmean``.
 
         x̄_k = mean(x_{k-b}, ..., x_{k+f}),   b = ⌊w/2⌋,   f = ⌈w/2⌉ - 1
 
@@ -44,15 +45,15 @@ class MovingAverage(Step):
 
 @dataclass(frozen=True)
 class Butterworth(Step):
-    """Filter by a Butterworth low-pass, forwards and backwards, so that nothing is delayed.
+    """Filter by a Butterworth low-pass, forwards and backwards, without a delay.
 
         |H(f)|² = 1 / (1 + (tan(π f/f_s)/tan(π f_c/f_s))^{2n}),   squared by the second pass
 
-    The same filter on q, v and u keeps linear equations of motion between them true.
+    If q, v and u pass the same filter, they still satisfy a linear equation of motion.
 
     Args:
-        cutoff: cut-off frequency f_c, Hz; the two passes together halve the amplitude at f_c.
-        order: order n of one pass.
+        cutoff: cut-off frequency f_c, Hz. The two passes together halve the amplitude at f_c.
+        order: order n of a single pass.
         signals: filtered signals.
     """
 
@@ -63,24 +64,23 @@ class Butterworth(Step):
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         rate = 1 / recording.sample_time("Butterworth")
         sections = scipy.signal.butter(self.order, self.cutoff, fs=rate, output="sos")
-        # A period of the cut-off at either end lets the start-up of the filter die out.
+        # The transient of the filter decays in a padding of a cut-off period at each end.
         padding = max(3 * (2 * len(sections) + 1), round(rate / self.cutoff))
-        smooth = recording.change(
-            self.signals, lambda x: scipy.signal.sosfiltfilt(sections, x, axis=0, padlen=padding)
-        )
-        return [smooth], f"low-pass of {self.cutoff:g} Hz on {', '.join(self.signals)}"
+        smooth = partial(scipy.signal.sosfiltfilt, sections, axis=0, padlen=padding)
+        filtered = recording.change(self.signals, smooth)
+        return [filtered], f"low-pass of {self.cutoff:g} Hz on {', '.join(self.signals)}"
 
 
 @dataclass(frozen=True)
 class RemoveJumps(Step):
     """Replace samples far from the median of their neighbors, such as jumps of a marker.
 
-    A sample is a jump where |x_k - median(x_{k-h}, ..., x_{k+h})| > threshold, h = (window - 1)/2.
-    The line between the good samples around it replaces it. A jump of more than h samples is not
-    detected. The first and last h samples are not judged.
+    A sample is a jump if |x_k - median(x_{k-h}, ..., x_{k+h})| > threshold, h = (window - 1)/2.
+    Jumps are replaced by linear interpolation. A jump of more than h samples is not detected. The
+    first and last h samples are not checked.
 
     Args:
-        threshold: largest distance that is no jump, SI units; one value, or one per column.
+        threshold: largest distance without a jump, SI units, one number, or one per column.
         window: number of samples, odd, or a time, such as ``"0.25 s"``.
         signals: repaired signals.
     """
@@ -115,7 +115,7 @@ class _SavitzkyGolaySlope(Step):
 
     def _slope(self, recording: Recording, values: np.ndarray) -> tuple[np.ndarray, int, float]:
         step = recording.sample_time(type(self).__name__)
-        # The shortest odd window that determines the polynomial.
+        # The minimum is the shortest odd window that determines the polynomial.
         window = window_samples(self.window, recording, self.order + 1 + self.order % 2, odd=True)
         slope = scipy.signal.savgol_filter(values, window, self.order, deriv=1, delta=step, axis=0)
         return slope, window, step
@@ -125,21 +125,21 @@ class _SavitzkyGolaySlope(Step):
 class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
     """Derive the velocity as the slope of a polynomial through ``window`` samples of q.
 
-    v_k depends on q up to half a window later, and so does a prediction that starts there. With
-    ``causal`` the polynomial goes through the sample and the ``window`` - 1 samples before it,
-    except for the first ``window`` - 1 samples. It carries more noise.
+    v_k, and a prediction that starts at v_k, depends on q up to half a window later. With
+    ``causal``, the polynomial is fitted to the sample and the ``window`` - 1 samples before it.
+    This velocity has more noise. The first ``window`` - 1 samples use the first window.
 
     Args:
         window: number of samples, odd, or a time, such as ``"50 ms"``.
         order: order of the polynomial.
-        causal: use only the past of each sample.
+        causal: true to use only the past of each sample.
     """
 
     causal: bool = False
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         if recording.v is not None:
-            raise LogError("the log has a velocity already: leave out SavitzkyGolayVelocity, or v")
+            raise LogError("the log already has a velocity: leave out SavitzkyGolayVelocity, or v")
         q = recording.q
         v, window, step = self._slope(recording, q)
         text = f"v from q in windows of {window * step:.3g} s"
@@ -152,7 +152,7 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
             ]
             start = [w @ q[:window] for w in weights[:-1]]
             v = np.vstack([*start, sliding_window_view(q, window, axis=0) @ weights[-1]])
-            text += ", from the past alone"
+            text += ", from past samples only"
         return [replace(recording, v=v)], text
 
 
@@ -160,9 +160,9 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
 class InputRates(_SavitzkyGolaySlope):
     """Append the rates of the inputs: u becomes (u, du/dt), 2 M columns.
 
-    For inputs that are positions: a tendon like a spring and a damper has the force
-    k (u - q) + c (du/dt - dq/dt). The rate is the slope of the polynomial through ``window``
-    samples of u around each sample, so it looks half a window ahead.
+    This step is for inputs that are positions. A tendon that acts like a spring and a damper has
+    the force k (u - q) + c (du/dt - dq/dt). The rate is the slope of a polynomial through
+    ``window`` samples of u around each sample, up to half a window later.
 
     Args:
         window: number of samples, odd, or a time, such as ``"50 ms"``.

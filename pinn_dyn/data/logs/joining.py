@@ -1,4 +1,4 @@
-"""Signals of a run that lie in several tables, or in the rows of a long table."""
+"""Join signals of a run from several tables, or from the rows of a long table."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.table import Table
 
-_SAME = 0.05  # of the usual sample time, between stamps of the same sample
-_PARTS = (r"[^\W_]+", r"[^\W\d_]+|\d+")  # of names: words, then also numbers
+_SAME = 0.05  # largest distance of stamps of the same sample, in usual sample times
+_PARTS = (r"[^\W_]+", r"[^\W\d_]+|\d+")  # parts of names: words; or words and numbers
 
 
 def widened(table: Table, key: str, time: Sequence[str], trajectory: str | None) -> Table:
-    """Return a table of rows of single joints with a row per time and columns ``<name>/<joint>``.
+    """Convert a table with a row per joint and time to a row per time.
+
+    The new columns are ``<name>/<joint>``.
 
     Args:
-        table: rows of single joints.
+        table: table with a row per joint and time.
         key: column that names the joint.
-        time: columns of the time; without any the rows of a joint are counted.
+        time: columns of the time. If empty, the rows of each joint are counted.
         trajectory: column of the run, or None.
 
     Raises:
@@ -45,19 +47,19 @@ def widened(table: Table, key: str, time: Sequence[str], trajectory: str | None)
 def joined(
     tables: Mapping[str, Table], clock: Clock, columns: Sequence[str], trajectory: str | None
 ) -> dict[str, Table]:
-    """Join tables that hold parts of the columns; the first column is the clock of the result.
+    """Join tables that hold parts of the columns. The first column is the clock of the result.
 
-    Tables with the same columns are of different runs. Words that only their names share tell
-    nothing; the other words of the names tell which tables belong together: ``run1_pos`` and
-    ``run1_vel``, or ``run1/pos`` and ``run1/vel``. A column ``elbow/q`` is the column ``q`` of a
-    table with ``elbow`` in its name.
+    Tables with the same columns belong to different runs. Words common to the names of all these
+    tables are ignored. Tables are matched by the remaining words: ``run1_pos`` and ``run1_vel``, or
+    ``run1/pos`` and ``run1/vel``. A column ``elbow/q`` is the column ``q`` of a table with
+    ``elbow`` in its name.
 
     Raises:
-        LogError: if no table has a column, or the names do not tell the runs apart.
+        LogError: if no table has a column, or the tables cannot be matched by their names.
     """
-    known = [*columns, *clock.columns]
-    tables = {stem: _prefixed(table, stem, known) for stem, table in tables.items()}
-    parts = {name: tuple(x for x in columns if x in table) for name, table in tables.items()}
+    requested = [*columns, *clock.columns]
+    tables = {stem: _prefixed(table, stem, requested) for stem, table in tables.items()}
+    parts = {name: tuple(filter(table.__contains__, columns)) for name, table in tables.items()}
     if len(tables) == 1 or any(len(part) == len(columns) for part in parts.values()):
         return dict(tables)
     kinds = sorted(dict.fromkeys(parts.values()), key=lambda part: columns[0] not in part)
@@ -80,13 +82,13 @@ def joined(
                 for run, names in runs.items()
             }
     raise LogError(
-        f"the files {listed(tables)} hold parts of the columns, and their names do not tell which "
-        "belong to the same run: name them as run1_q, run1_u, run2_q, run2_u"
+        f"the files {listed(tables)} hold parts of the columns, but their names do not tell which "
+        "files belong to the same run: name them as run1_q, run1_u, run2_q, run2_u"
     )
 
 
 def _prefixed(table: Table, stem: str, columns: Sequence[str]) -> Table:
-    """Return a table with its columns ``q`` as columns ``<word>/q``, by a word of its name."""
+    """Rename a column ``q`` to the requested ``<word>/q``, where the table's name has the word."""
     pairs = {x: x.rpartition("/") for x in columns if x not in table}
     names = {
         x: name
@@ -98,7 +100,7 @@ def _prefixed(table: Table, stem: str, columns: Sequence[str]) -> Table:
 
 
 def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Table:
-    """Join the rows of tables with the same stamps, otherwise those of all clocks, with gaps."""
+    """Join the rows of tables with the same stamps; otherwise merge all rows, with empty cells."""
     shortest = min(map(len, tables))
     if 0 < max(map(len, tables)) - shortest <= 1 and not all(
         x in table for table in tables for x in clock.columns
@@ -127,14 +129,14 @@ def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Tabl
         if (back := np.diff(x) < 0).any():
             location = table.place(int(back.argmax()) + 1, clock.name)
             raise LogError(f"{location}: the time goes back, expected a single run in each file")
-    frame = pd.concat(
-        [
-            frame.set_axis([f"{row} of {Path(table.name).name}" for row in frame.index])
-            for table, frame in zip(tables, frames, strict=True)
-        ]
-    )
+    frame = pd.concat(map(_with_file, tables))
     order = np.argsort(np.concatenate(stamps), kind="stable")
     return replace(first, frame=frame.iloc[order], name=name, notes=notes)
+
+
+def _with_file(table: Table) -> pd.DataFrame:
+    file = Path(table.name).name
+    return table.frame.set_axis([f"{row} of {file}" for row in table.frame.index])
 
 
 def _same(t: np.ndarray, x: np.ndarray) -> bool:

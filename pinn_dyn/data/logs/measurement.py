@@ -1,4 +1,4 @@
-"""One measurement of a log check, with its verdict."""
+"""A measurement of a log check with its verdict."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ class Measurement:
     """A number that a check measured, and its meaning for a training.
 
     Attributes:
-        name, place, value, expected: quantity; run, column or input; number; range of a good log.
-        verdict, text: ``"stop"`` if a training makes no sense; a sentence unless ``"ok"``.
+        name: measured quantity.
+        place: run, column or input.
+        value: the number.
+        expected: range of a log without faults.
+        verdict: ``"ok"``, ``"warning"``, or ``"stop"`` if the log is not suitable for training.
+        text: explanation, unless the verdict is ``"ok"``.
         section: section of the documentation.
     """
 
@@ -37,6 +41,6 @@ def judged(
     verdict: Verdict = "warning",
     section: str = Measurement.section,
 ) -> Measurement:
-    """Return a measurement with a verdict and a text if it is bad, else ``"ok"``."""
+    """Return a measurement with the verdict and text if ``bad``, otherwise with ``"ok"``."""
     verdict, text = (verdict, text) if bad else ("ok", "")
     return Measurement(name, place, float(value), expected, verdict, text, section)

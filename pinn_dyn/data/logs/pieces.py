@@ -1,4 +1,4 @@
-"""Trajectories from cleaned recordings: one sample time, pieces of one length."""
+"""Trajectories from cleaned recordings, with a common sample time and length."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Cleaned:
 
     Attributes:
         split: train, validation or test.
-        raw: the stretch as it was read, in SI units.
-        clean: the stretches that the steps made of it, on the same clock.
+        raw: the stretch before the cleaning, in SI units.
+        clean: the stretches after the cleaning, with the same clock.
     """
 
     split: str
@@ -32,14 +32,14 @@ class Cleaned:
 
 
 def one_sample_time(items: Sequence[Recording]) -> float:
-    """Return the sample time that all stretches share, s."""
+    """Return the common sample time of all stretches, s."""
     times = [item.sample_time("a data set") for item in items]
     shared = float(np.median(times))
     for item, step in zip(items, times, strict=True):
-        # Rounded times leave the sample time of a short stretch uncertain.
+        # Rounding of times makes the sample time of a short stretch uncertain.
         if abs(step / shared - 1) > max(1e-3, 0.05 / (len(item) - 1)):
             raise LogError(
-                f"{item.place}: its sample time is {step:.9g} s, that of the other stretches "
+                f"{item.place}: the sample time is {step:.9g} s, but that of other stretches is "
                 f"{shared:.9g} s: add a Resample step"
             )
     return shared
@@ -48,25 +48,24 @@ def one_sample_time(items: Sequence[Recording]) -> float:
 def pieces_of(
     name: str, part: Part, stretches: Sequence[Recording], step: float
 ) -> tuple[list[Recording], str]:
-    """Cut the cleaned stretches of a split into rollouts; return them and a note.
+    """Cut the cleaned stretches of a split into rollouts; return the rollouts and a note.
 
     Raises:
-        LogError: if a piece is no multiple of the sample time, or longer than every stretch.
+        LogError: if the piece is no multiple of the sample time, or longer than all stretches.
     """
     if part.piece == "whole":
         pieces = list(stretches)
         return pieces, f"{summary(pieces, step)}, each one rollout"
     span = round(part.piece / step)
     if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
-        raise LogError(f"{name}.piece is {part.piece} s, expected a multiple of {step:g} s")
-    pieces = [
-        replace(
-            item.rows(slice(first, first + span + 1)),
-            past=item.rows(slice(max(first - round(_PAST / step), 0), first)),
+        raise LogError(
+            f"{name}.piece is {part.piece} s, expected a multiple of the sample time, {step:g} s"
         )
-        for item in stretches
-        for first in _starts(len(item), span)
-    ]
+    pieces = []
+    for item in stretches:
+        for first in _starts(len(item), span):
+            past = item.rows(slice(max(first - round(_PAST / step), 0), first))
+            pieces.append(replace(item.rows(slice(first, first + span + 1)), past=past))
     if not pieces:
         raise LogError(f"{name}: no stretch is as long as a piece of {part.piece} s")
     unused = max(sum(item.duration for item in stretches) - len(pieces) * span * step, 0)
@@ -74,14 +73,14 @@ def pieces_of(
 
 
 def _starts(samples: int, span: int) -> list[int]:
-    """Return the first samples of the pieces of ``span`` + 1 samples of a stretch."""
+    """Return the first sample of each piece of ``span`` + 1 samples in a stretch."""
     last, count = samples - 1 - span, samples // span
     stride = min(span, last / max(count - 1, 1))
     return [round(k * stride) for k in range(count)] if last >= 0 else []
 
 
 def trajectory(recording: Recording, step: float, interpolation: Interpolation) -> Trajectory:
-    """Return a recording as tensors, from t = 0 on."""
+    """Return a recording as a trajectory that starts at t = 0."""
     assert recording.v is not None
     q, v, u = (torch.from_numpy(x.copy()) for x in (recording.q, recording.v, recording.u))
     t = torch.arange(len(recording), dtype=torch.float64) * step
@@ -92,7 +91,7 @@ def trajectory(recording: Recording, step: float, interpolation: Interpolation) 
 
 
 def summary(recordings: Sequence[Recording], step: float) -> str:
-    """Return number and lengths of recordings, for the report."""
+    """Return the number and lengths of recordings for the report."""
     lengths = [recording.duration for recording in recordings]
     return (
         f"{len(recordings)} trajectories of {min(lengths):.6g} to {max(lengths):.6g} s, "

@@ -1,4 +1,4 @@
-"""Files and data frames of a log, read to recordings in SI units."""
+"""Read files and data frames of a log as recordings in SI units."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.table import Request, Table
 
 Files = str | Sequence[str] | Mapping[str, pd.DataFrame]
-_OUT_OF_ORDER = 50  # rows by which a single row is late; rows of the shortest run
+_OUT_OF_ORDER = 50  # largest displacement of a row that is out of order; shortest run, in rows
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of a log, and the way from its tables to recordings.
+    """Columns of a log, and the conversion of its tables to recordings.
 
     Attributes:
         time: clock.
         signals: columns of q, v (if measured) and u.
-        trajectory: column that tells the runs of a table apart, or None.
+        trajectory: column that names the run of a row, or None.
         long: column that names the joint of a row, or None.
-        request: what a reader gets.
+        request: request for the readers.
         repairs: faults that the cleaning repairs.
     """
 
@@ -60,7 +60,7 @@ class Layout:
             report.warn("rows", f"{listed(stems.index)}: {note}")
         several = len(tables) > 1
         for stem in list(tables):
-            table = tables.pop(stem)  # its memory is that of all numbers
+            table = tables.pop(stem)  # releases the memory of the table after its conversion
             runs = table.runs(self.trajectory, stem)
             if self.trajectory is not None and several:
                 runs = {f"{stem}:{run}": rows for run, rows in runs.items()}
@@ -74,22 +74,31 @@ class Layout:
         for path in find_files(root, files):
             stem = run_name(path, root)
             if stem in paths:
-                raise LogError(f"{paths[stem]} and {path} are both the run {stem!r}: rename one")
+                raise LogError(
+                    f"{paths[stem]} and {path} both have the run name {stem!r}: rename a file"
+                )
             paths[stem] = path
-        request = replace(self.request, partial=len(paths) > 1)
-        return {
-            ":".join(x for x in (stem if len(paths) > 1 or not run else "", run) if x): table
-            for stem, path in paths.items()
-            for run, table in read_tables(path, request).items()
-        }
+        several = len(paths) > 1
+        request = replace(self.request, partial=several)
+        tables: dict[str, Table] = {}
+        for stem, path in paths.items():
+            for run, table in read_tables(path, request).items():
+                name = f"{stem}:{run}" if several else run
+                tables[name if run else stem] = table
+        return tables
 
     def recordings(
         self, table: Table, runs: Mapping[str, np.ndarray], report: Report
     ) -> list[tuple[np.ndarray, Recording]]:
-        """Convert the runs of a table, masks of its rows, to SI units, and check them.
+        """Convert the runs of a table to SI units, and check them.
+
+        Args:
+            table: the table.
+            runs: mask of the rows of each run.
+            report: report that gets notes, warnings and measurements.
 
         Returns:
-            For each run the numbers of its rows in the table, and the recording.
+            The indices of the rows in the table, and the recording, of each run.
         """
         values = {
             signal: columns.to_si(table.numbers(columns.columns, signal))
@@ -119,7 +128,7 @@ class Layout:
                 name = f"{run}:{k + 1}" if len(pieces) > 1 else run
                 chosen: np.ndarray | slice = rows[piece]
                 if len(piece) == len(table) and (np.diff(rows[piece]) == 1).all():
-                    chosen = slice(None)  # no copy of a whole table
+                    chosen = slice(None)  # avoids a copy of the table
                 part = {signal: x[chosen] for signal, x in values.items()}
                 item = Recording(name, t[piece], part["q"], part.get("v"), part["u"])
                 read, item = self._checked(item, table, rows[piece], report)
@@ -131,15 +140,19 @@ class Layout:
     def _checked(
         self, item: Recording, table: Table, rows: np.ndarray, report: Report
     ) -> tuple[np.ndarray, Recording]:
-        """Fill the empty cells of the rows of a table, and check them."""
+        """Fill the empty cells of a recording, and check it.
+
+        Return the indices of its rows in the log, and the recording.
+        """
         part = table.select(rows)
-        if np.isnan(item.values()).any() and (np.diff(item.t) >= 0).all():  # or check_clock raises
+        # If times decrease, check_clock raises an error below.
+        if np.isnan(item.values()).any() and (np.diff(item.t) >= 0).all():
             splits = "gaps" in self.repairs
             stays = fill(item, self.signals, part, self.request.max_age, report, splits=splits)
             rows, item, part = rows[stays], item.rows(stays), part.select(stays)
         if count := rows_before_first_sample(item.q):
-            text = "the robot is not yet measured: left out"
-            report.warn("rows", f"{part.place(0)}: q jumps after the first {count} rows, {text}")
+            text = f"q jumps after the first {count} rows, before the first measurement"
+            report.warn("rows", f"{part.place(0)}: {text}: left out")
             stays = np.arange(count, len(item))
             rows, item, part = rows[stays], item.rows(stays), part.select(stays)
         report.measurements += check_clock(item.t, part, self.time, self.repairs)
@@ -150,7 +163,7 @@ class Layout:
 
 
 def _in_order(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the order of rows that sorts single rows, and the rows at which a run starts."""
+    """Return an order that sorts single late rows, and the rows at which further runs start."""
     order = np.argsort(t, kind="stable")
     spacing = np.diff(t[order])
     far = np.abs(order - np.arange(len(t))) > _OUT_OF_ORDER

@@ -1,4 +1,4 @@
-"""A stretch of a log in SI units, and the report of what the cleaning did to it."""
+"""A stretch of a log in SI units, and the report of its cleaning."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 
 SIGNALS: tuple[Literal["q", "v", "u"], ...] = ("q", "v", "u")
-_ROUND = (1, 2, 2.5, 4, 5, 8, 10)  # rates of which usual pieces are a multiple
-_LONGEST_GAP = 10  # sample times that are interpolated
-_GAP_BURSTS, _MANY = 3, 5000  # usual bursts in a gap; rows of which one in a thousand is a burst
-_CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
+_ROUND = (1, 2, 2.5, 4, 5, 8, 10)  # round rates; usual pieces are a multiple of their sample time
+_LONGEST_GAP = 10  # longest gap that is interpolated, in sample times
+_GAP_BURSTS, _MANY = 3, 5000  # usual bursts in a gap; rows for a quantile of 0.999
+_CLOCK_TOLERANCE = 0.02  # error of rounded times, in sample times
 
 
 def clock_steps(t: np.ndarray) -> str:
-    """Return the steps that give a run of times ``(T,)`` in s a uniform clock.
+    """Return the text of cleaning steps for a uniform clock, for times ``(T,)`` in s.
 
-    The rate is round, near the usual one. SplitGaps leaves no gap that Resample would refuse.
+    The rate is a round number near the usual rate. SplitGaps splits all gaps that Resample does not
+    accept.
     """
     spacing = np.diff(t)
     usual = float(np.median(spacing[spacing > 0]))
@@ -39,10 +40,10 @@ def clock_steps(t: np.ndarray) -> str:
 
 
 def burst_steps(t: np.ndarray) -> list[str]:
-    """Return lines with the steps that repair stamps in bursts, ``(T,)`` in s.
+    """Return lines of cleaning steps for stamps in bursts, ``(T,)`` in s.
 
-    The rate is that of the rows between gaps, which are longer than usual bursts; it is round if
-    the stamps allow it.
+    The rate is the rate of rows between gaps. A gap is longer than usual bursts. The rate is
+    rounded if the stamps allow it.
     """
     spacing = np.diff(t)
     burst = float(np.quantile(spacing, 0.999 if len(t) > _MANY else 0.95))
@@ -62,7 +63,7 @@ def burst_steps(t: np.ndarray) -> list[str]:
 
 
 def round_rate(sample_time: float) -> float:
-    """Return a round rate in Hz near that of a sample time, s."""
+    """Return a round rate in Hz near the rate of a sample time in s."""
     decade = 10 ** np.floor(-np.log10(sample_time))
     return min((float(decade * x) for x in _ROUND), key=lambda x: abs(np.log(x * sample_time)))
 
@@ -75,9 +76,9 @@ class Recording:
         run: name of the run.
         t: times, ``(T,)``, s.
         q: configuration, ``(T, N)``.
-        v: velocity, ``(T, N)``, or None while there is none.
+        v: velocity, ``(T, N)``, or None before it is derived.
         u: input, ``(T, M)``.
-        past: the samples right before, or None.
+        past: the samples directly before the stretch, or None.
     """
 
     run: str
@@ -106,19 +107,23 @@ class Recording:
         return Recording(self.run, self.t[index], self.q[index], v, self.u[index])
 
     def values(self) -> np.ndarray:
-        """Return all signals side by side, ``(T, 2N + M)`` or ``(T, N + M)``."""
+        """Return all signals in a matrix, ``(T, 2N + M)``, or ``(T, N + M)`` without v."""
         return np.hstack([x for x in (self.q, self.v, self.u) if x is not None])
 
     def change(
         self, signals: Sequence[str], function: Callable[[np.ndarray], np.ndarray]
     ) -> Recording:
-        """Return the recording with a function applied to signals, ``(T, K) -> (T, K)``."""
+        """Apply a function, ``(T, K) -> (T, K)``, to signals of the recording."""
         values = {name: getattr(self, name) for name in signals}
         changed: Any = {name: function(x) for name, x in values.items() if x is not None}
         return replace(self, **changed)
 
     def sample_time(self, user: str) -> float:
-        """Return the sample time of a uniform clock, s, or raise a LogError that names ``user``."""
+        """Return the sample time of a uniform clock, s.
+
+        Raises:
+            LogError: if the clock is not uniform. The message names the ``user`` of the clock.
+        """
         t = self.t
         if len(t) < 2:
             raise LogError(f"{self.run}: {user} needs at least 2 samples, got {len(t)}")
@@ -136,14 +141,14 @@ class Recording:
 
 @dataclass
 class Report:
-    """Measurements of the checks, and notes on what each step did to each run."""
+    """Measurements of the checks, and notes of each step on each run."""
 
     name: str
     measurements: list[Measurement] = field(default_factory=list)
     sections: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
     def add(self, section: str, run: str, text: str) -> None:
-        """Add a note on one run to a section."""
+        """Add a note on a run to a section."""
         self.sections.setdefault(section, {}).setdefault(text, []).append(run)
 
     def warn(self, name: str, text: str) -> None:
@@ -152,7 +157,7 @@ class Report:
 
     @property
     def warnings(self) -> list[str]:
-        """Texts of the measurements that are warnings."""
+        """Texts of all measurements with a warning."""
         return list(dict.fromkeys(x.text for x in self.measurements if x.verdict != "ok"))
 
     def markdown(self) -> str:

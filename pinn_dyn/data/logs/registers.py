@@ -1,4 +1,4 @@
-"""Numbers that are no measurements: unsigned registers, and rows before the first sample."""
+"""Detect unsigned registers with negative numbers, and rows before the first measurement."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.table import Table
 
 _BITS = (16, 32)
-_CONTINUOUS = 0.1  # largest step of the signed numbers over that of the unsigned ones
-_FIRST_STEP = 10.0  # times the largest later step, of a step from rows before the first sample
-_FEW = 0.1  # share of the rows that may lie before the first sample
+_CONTINUOUS = 0.1  # largest ratio of the largest steps of signed and unsigned numbers
+_FIRST_STEP = 10.0  # smallest ratio of the first step to the largest later step
+_FEW = 0.1  # largest share of rows before the first measurement
 
 
 def check_registers(table: Table, signal: str, columns: Columns, values: np.ndarray) -> None:
-    """Refuse negative numbers of a register that the log reads as unsigned.
+    """Raise an error for negative numbers that were logged from a register as unsigned numbers.
 
     All numbers ``(T, K)`` are multiples of a step, in the unit of the file. Some lie in the lower
-    half of 2^16 or 2^32 steps, others in the upper half, and the numbers are continuous if this
-    period is subtracted from the upper ones.
+    half of 2^16 or 2^32 steps, and some in the upper half. If this period is subtracted from the
+    numbers in the upper half, the signal is continuous.
 
     Raises:
-        LogError: naming the first such row, and the number to subtract.
+        LogError: if such numbers exist. The message names the first row and the period.
     """
     for name, raw in zip(columns.columns, columns.from_si(values).T, strict=True):
         if raw.min() < 0 or not np.ptp(raw):
@@ -34,21 +34,21 @@ def check_registers(table: Table, signal: str, columns: Columns, values: np.ndar
             upper = counts >= 2 ** (bits - 1)
             signed = np.where(upper, counts - 2**bits, counts)
             smooth = np.abs(np.diff(signed)).max() < _CONTINUOUS * np.abs(np.diff(counts)).max()
-            whole = np.abs(raw / step - counts).max() < 0.1 and counts.max() < 2**bits
-            if whole and smooth and upper.any():
+            integers = np.abs(raw / step - counts).max() < 0.1 and counts.max() < 2**bits
+            if integers and smooth and upper.any():
                 row, period = int(upper.argmax()), 2**bits * step
                 raise LogError(
                     f"{table.place(row, name, signal)}: {raw[row]:.6g} is a negative number of an "
-                    f"unsigned register of {bits} bits ({int(upper.sum())} such rows): subtract "
-                    f"{period:.6g} from all values above {period / 2:.6g} before"
+                    f"unsigned register of {bits} bits ({int(upper.sum())} such rows): first "
+                    f"subtract {period:.6g} from all values above {period / 2:.6g}"
                 )
 
 
 def rows_before_first_sample(q: np.ndarray) -> int:
-    """Return the number of equal first rows of q ``(T, N)`` from which q jumps to its first sample.
+    """Return the number of equal first rows of q ``(T, N)`` before a jump to the first measurement.
 
-    A jump is ten times as large as all later steps of its column. Zeros that a logger writes
-    before the first message of a robot are such rows.
+    The jump is more than ten times as large as all later steps of its column. A logger may write
+    zeros before the first message of a robot.
     """
     steps = np.abs(np.diff(q, axis=0))
     moving = steps.any(axis=1)

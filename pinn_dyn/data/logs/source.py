@@ -1,4 +1,4 @@
-"""Logs of a robot as a data source: read, checked, split, cleaned."""
+"""Data source that reads, checks, splits and cleans logs of a robot."""
 
 from __future__ import annotations
 
@@ -43,36 +43,40 @@ class _LoadedLog(NamedTuple):
 class LogSource(DataSource):
     """Trajectories from logs: CSV, MATLAB, HDF5, NPZ, Parquet, bags of ROS, or data frames.
 
-    Runs are split, or cut with a guard, before the steps: no filter sees both sides of a border.
-    Without a velocity, :class:`SavitzkyGolayVelocity` derives it. Columns and parts may be
-    mappings, as ``q={"columns": ["q1", "q2"], "unit": "deg"}``.
+    Runs are split, or cut with a guard, before the cleaning steps. A filter therefore never uses
+    samples on both sides of a border. A missing velocity is derived by
+    :class:`SavitzkyGolayVelocity`. Columns and parts may be mappings, such as
+    ``q={"columns": ["q1", "q2"], "unit": "deg"}``.
 
     Args:
-        name: short name, for tables and titles; None takes that of the first file.
+        name: short name for tables and titles; None for the name of the first file.
         files: names or glob patterns in the folder ``root``; or a data frame, or data frames by the
-            name of their run. Files that hold parts of the columns are joined.
+            name of their run. Files with parts of the columns are joined.
         root: folder of the files.
         time: columns of the time, or ``{rate: 100}`` for a log without time, see :class:`Clock`.
         q: columns of the configuration, N.
-        u: columns of the input, M; None or [] for a robot that nothing drives.
-        v: columns of the velocity, N, or None; in the order of q if their names tell it.
-        max_age: oldest message of another topic, or value of a slower column, of a row, s.
-        sep: separator of the cells of a text file; None detects it.
-        trajectory: column that tells the runs of a file apart, or None where a file is one run.
-        long: column that names the joint, of a log with a row per joint and time. Other columns
-            are then ``<name>/<joint>``.
-        steps: names and steps of the cleaning, in order; None entries are left out.
-        delay: time by which the inputs act late, s, one or M: :class:`InputDelay` as the last step.
+        u: columns of the input, M; None or [] for a robot without inputs.
+        v: columns of the velocity, N, or None. If their names match those of q, they are sorted in
+            the order of q.
+        max_age: largest age of a message of another topic, or of a value in a slower column, in a
+            row, s.
+        sep: separator of the cells of a text file; None detects the separator.
+        trajectory: column that names the run of a row, or None if each file is a single run.
+        long: column that names the joint, for a log with a row per joint and time. The other
+            columns are then ``<name>/<joint>``.
+        steps: cleaning steps by name, in order; entries with None are left out.
+        delay: dead time of the inputs, s, one number or M; adds a last step :class:`InputDelay`.
         validation, test: whole runs, ``{runs: 2, piece: 5.0}``, or the ends of runs,
-            ``{seconds: 3.0, piece: 3.0}``, see :class:`Part`; None takes :func:`default_split`.
-        guard: time left out between training, validation and test of one run, s.
-        shortest: training stretches shorter than this are dropped, s; at least one window.
+            ``{seconds: 3.0, piece: 3.0}``, see :class:`Part`; None for :func:`default_split`.
+        guard: time that is left out between training, validation and test in a run, s.
+        shortest: shortest training stretch, s; at least the length of a window. Shorter stretches
+            are dropped.
         seed: seed of the choice of runs.
-        interpolation: motion of the input between samples.
-        angles: numbers of the coordinates that are angles of joints.
+        interpolation: interpolation of the input between samples.
+        angles: indices of the coordinates that are angles of joints.
 
     Raises:
-        LogError: on columns, units or parts that do not fit; of the files, by :meth:`load`.
+        LogError: if columns, units or parts do not match. :meth:`load` raises errors of the files.
     """
 
     def __init__(
@@ -123,7 +127,7 @@ class LogSource(DataSource):
         self.delay = delay
         self._repairs = {fault for step in self.steps.values() for fault in step.repairs}
         if (validation is None) != (test is None):
-            raise LogError("expected both validation and test, or neither for the default split")
+            raise LogError("set both validation and test, or neither for the default split")
         self.validation: Any = validation and validated(Part, "validation", validation)
         self.test: Any = test and validated(Part, "test", test)
         self.guard = guard
@@ -132,7 +136,9 @@ class LogSource(DataSource):
         self.interpolation = interpolation
         self.angles = tuple(angles)
         if not {*angles} <= {k for k, unit in enumerate(self.q.units) if unit == "rad"}:
-            raise LogError(f"angles is {list(angles)}, expected numbers of angles in q, from 0")
+            raise LogError(
+                f"angles is {list(angles)}, expected indices (from 0) of coordinates in rad"
+            )
         self.labels = self.q.labels
         self.input_labels = self.u.labels
         for step in self.steps.values():
@@ -149,7 +155,7 @@ class LogSource(DataSource):
 
     @property
     def cleaning(self) -> dict[str, Step]:
-        """The steps, and the shift of the inputs by the delay."""
+        """Cleaning steps, with the shift of the inputs by the delay."""
         return self.steps | ({"input delay": InputDelay(self.delay)} if np.any(self.delay) else {})
 
     @property
@@ -158,7 +164,11 @@ class LogSource(DataSource):
         return sum((np.resize(x, len(self.input_labels)) for x in delays), super().input_delay)
 
     def load(self) -> Splits:
-        """Return the cleaned trajectories, or raise a LogError on a file that cannot be used."""
+        """Return the cleaned trajectories.
+
+        Raises:
+            LogError: if a file is not usable.
+        """
         return self._loaded.splits
 
     def names(self) -> dict[str, list[str]]:
@@ -166,32 +176,33 @@ class LogSource(DataSource):
 
     @property
     def cleaned(self) -> list[Cleaned]:
-        """Every stretch before and after the cleaning: training first, then validation, test."""
+        """All stretches before and after the cleaning, in the order training, validation, test."""
         return self._loaded.cleaned
 
     @property
     def measurements(self) -> list[Measurement]:
-        """Measurements of the checks of every log."""
+        """Measurements of the checks that are made for every log."""
         return self._loaded.report.measurements
 
     @property
     def warnings(self) -> list[str]:
-        """Texts of the measurements that are warnings."""
+        """Texts of all measurements with a warning."""
         return self._loaded.report.warnings
 
     @property
     def report(self) -> str:
-        """Notes of each step, and all warnings, as Markdown."""
+        """Warnings, and notes of each step, as Markdown."""
         return self._loaded.report.markdown()
 
     def recordings(self, frame: pd.DataFrame) -> list[tuple[np.ndarray, Recording, Recording]]:
-        """Read the runs of a frame with the columns and units of the log, and clean each alone.
+        """Read the runs of a frame with the columns and units of the log, and clean each run.
 
         Returns:
-            For each run the rows in the frame, these in SI units, and the run after the cleaning.
+            For each run: the indices of its rows in the frame, the rows in SI units, and the run
+            after the cleaning.
 
         Raises:
-            LogError: as :meth:`load`, or if the steps do not leave one stretch of each run.
+            LogError: as :meth:`load`, or if the steps split or drop a run.
         """
         table, report = Table(frame, "the frame"), Report(self.name)
         column = self.trajectory
@@ -200,7 +211,9 @@ class LogSource(DataSource):
         cleaned = clean([Cleaned("", raw, [raw]) for _, raw in raws], self.cleaning, report)
         for part in cleaned:
             if (count := len(part.clean)) != 1:
-                raise LogError(f"{part.raw.place}: the steps leave {count} stretches, expected one")
+                raise LogError(
+                    f"{part.raw.place}: the cleaning gives {count} stretches, expected one"
+                )
         return [
             (rows, part.raw, part.clean[0]) for (rows, _), part in zip(raws, cleaned, strict=True)
         ]

@@ -1,4 +1,4 @@
-"""Cleaning steps for the peculiarities of single logs; templates for your own steps."""
+"""Cleaning steps for rare faults of logs; templates for user-defined steps."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from pinn_dyn.data.logs.step import Step, window_samples
 
 @dataclass(frozen=True)
 class SubtractStart(Step):
-    """Subtract from q its mean over the first samples of a run, for sensors that drift.
+    """Subtract the mean of q over the first samples of a run, for sensors that drift.
 
-    Right only if every run starts at rest in the same pose.
+    All runs must start at rest in the same pose.
 
     Args:
         samples: number of samples at rest, or their time, such as ``"0.5 s"``.
@@ -34,13 +34,13 @@ class SubtractStart(Step):
 
 @dataclass(frozen=True)
 class InterpolateHeld(Step):
-    """Draw straight lines between the updates of a sensor that is slower than the log.
+    """Interpolate linearly between the updates of a sensor that is slower than the log.
 
-    A value that repeats the value before is stale, up to ``longest`` repeats in a row; a longer
-    stand-still stays as it is. Each column is treated alone.
+    Up to ``longest`` repeats of a value in a row are replaced. Longer standstills are not changed.
+    Each column is processed separately.
 
     Args:
-        longest: the most repeats in a row that count as stale, or their time, such as ``"80 ms"``.
+        longest: largest number of repeats in a row, or their time, such as ``"80 ms"``.
         signals: signals that are interpolated.
     """
 
@@ -57,7 +57,7 @@ class InterpolateHeld(Step):
                 held = np.r_[False, column[1:] == column[:-1]]
                 edges = np.flatnonzero(np.diff(np.r_[False, held, False])).reshape(-1, 2)
                 for first, end in edges:
-                    # At the end of the log no update follows that a line could lead to.
+                    # No update follows at the end of the log.
                     if end - first > longest or end == len(column):
                         held[first:end] = False
                 shares.append(float(held.mean()))
@@ -74,12 +74,12 @@ class InterpolateHeld(Step):
 
 @dataclass(frozen=True)
 class PolynomialFit(Step):
-    """Fit polynomials, centered and scaled as MATLAB's ``[p, S, mu] = polyfit(t, x, n)``.
+    """Fit polynomials, centered and scaled like MATLAB's ``[p, S, mu] = polyfit(t, x, n)``.
 
         x(t) ≈ Σ_i p_i z^i,   z = (t - μ)/σ,   μ = mean(t), σ = std(t) (over T - 1)
 
-    Each segment is fitted alone and becomes its own recording, as polynomials of neighboring
-    segments do not meet. A missing velocity is the derivative of the polynomial of q.
+    Each segment is fitted separately and becomes a separate recording, since the polynomials of
+    neighboring segments do not meet. A missing velocity is the derivative of the polynomial of q.
 
     Args:
         degree: degree n.
@@ -125,16 +125,17 @@ class PolynomialFit(Step):
 
 @dataclass(frozen=True)
 class RowClock(Step):
-    """Take times from the numbers of the rows, where the stamps come in bursts::
+    """Replace stamps that come in bursts by times from the row numbers::
 
         t_k = a + k / rate
 
-    A logger that empties a buffer stamps its rows when it writes them, not when they were sampled:
-    many rows share one stamp, or follow within microseconds, and then nothing comes for a while. a
-    is that of the line through the stamps, by least squares. Right only where no row is missing.
+    A logger with a buffer stamps its rows when it writes them, not when they were sampled. Many
+    rows then have the same stamp or follow within microseconds, before a pause. a is fitted to the
+    stamps by least squares. No rows may be missing.
 
     Args:
-        longest: longest time between a stamp and the line, s: some bursts. More means lost rows.
+        longest: largest distance of a stamp from the line, s: the length of some bursts. A larger
+            distance indicates missing rows.
         rate: samples per second, Hz.
     """
 

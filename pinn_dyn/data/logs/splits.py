@@ -1,4 +1,4 @@
-"""The assignment of runs, or of parts of a run, to training, validation and test."""
+"""Assign runs, or parts of runs, to training, validation and test."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.source import SPLITS
 from pinn_dyn.wording import did_you_mean
 
-# The default split: from this number of runs on it keeps runs whole.
+# The default split assigns whole runs from this number of runs on.
 _WHOLE_RUNS = 5
-_SHARE = 0.15  # of the runs, or of each run, for the test, and again for the validation
-_PIECE, _GUARD = 5.0, 0.5  # s, at most
+_SHARE = 0.15  # share of the runs, or of each run, for the test and for the validation
+_PIECE, _GUARD = 5.0, 0.5  # largest lengths, s
 
 
 @dataclass(config=STRICT)
 class Part:
-    """Validation or test data: whole runs, or seconds of the other runs.
+    """Validation or test data: whole runs, or the ends of runs.
 
     Args:
-        piece: length of the rollouts, s; ``"whole"``: each stretch is one rollout.
+        piece: length of the rollouts, s; ``"whole"`` if each stretch is a rollout.
         runs: number of runs, drawn by the seed, or the names of the runs.
-        seconds: duration at the end of every other run, s; either this or ``runs``.
+        seconds: duration at the end of each run that is not assigned as a whole, s. Exactly one of
+            ``runs`` and ``seconds`` is required.
     """
 
     piece: PositiveFloat | Literal["whole"]
@@ -39,11 +40,13 @@ class Part:
 
     def __post_init__(self) -> None:
         if (self.runs is None) == (self.seconds is None):
-            raise LogError(f"expected either runs or seconds, not {self.runs} and {self.seconds}")
+            raise LogError(
+                f"expected either runs or seconds, not runs={self.runs} and seconds={self.seconds}"
+            )
 
     @property
     def names(self) -> list[str]:
-        """Names of the runs, where they are named."""
+        """Names of the runs, if ``runs`` has names."""
         return [] if self.runs is None or isinstance(self.runs, int) else [*map(str, self.runs)]
 
 
@@ -52,10 +55,10 @@ def default_split(
 ) -> tuple[Part, Part, float]:
     """Choose validation, test and guard (s) of a log from the times of its runs, s.
 
-    Of five runs or more, 15 % are the test and as many the validation, drawn by the seed among the
-    runs of at least the median length. Of fewer runs, the last 15 % of each are the test and the
-    15 % before them the validation. Both are cut into pieces of at most 5 s, which are still
-    possible after the cleaning has dropped ``lost`` s of each stretch.
+    With five or more runs, 15 % of the runs are the test, and 15 % the validation. The seed draws
+    them from the runs of at least the median length. With fewer runs, the last 15 % of each run are
+    the test, and the 15 % before are the validation. Both are cut into pieces of at most 5 s, short
+    enough for stretches from which the cleaning drops ``lost`` s.
     """
     spacing = np.concatenate([np.diff(t) for t in runs.values()])
     step = float(np.median(spacing[spacing > 0]))
@@ -63,7 +66,7 @@ def default_split(
     whole_runs = len(runs) >= _WHOLE_RUNS
     median, shortest = float(np.median([*lengths.values()])), min(lengths.values())
     longest = min(_PIECE, (median if whole_runs else _SHARE * shortest) - lost)
-    # A multiple of the sample time.
+    # The piece is a multiple of the sample time.
     piece = round(max(int(longest / step + 1e-6), 1) * step, 9)
     if whole_runs:
         long = [name for name, length in lengths.items() if length >= median - 0.5 * step]
@@ -76,9 +79,9 @@ def default_split(
 
 
 def fitting(part: Part, stretches: Sequence[Recording], lead: float, report: Report) -> Part:
-    """Shorten the pieces of a part whose runs are as long as a piece, by the ``lead`` s they lose.
+    """Shorten the pieces of a part if its runs are too short after losing ``lead`` s.
 
-    A shift of the inputs drops the beginning of each run.
+    A shift of the inputs drops ``lead`` s at the beginning of each run.
     """
     longest = max(stretches, key=lambda item: item.duration)
     if not lead or part.piece == "whole" or longest.duration - lead >= part.piece:
@@ -103,10 +106,11 @@ def split(
 ) -> dict[str, list[Recording]]:
     """Assign whole runs, and cut the other runs into training, guard, validation, guard, test.
 
-    Validation and test that are cut begin ``lead`` s earlier, which a shift of the inputs drops.
+    Cut stretches for validation and test begin ``lead`` s earlier, since a shift of the inputs
+    drops ``lead`` s.
 
     Raises:
-        LogError: on unknown or doubly used runs, or too few or too short ones.
+        LogError: if a run is unknown or assigned twice, or runs are too few or too short.
     """
     names = list(dict.fromkeys(recording.run for recording in recordings))
     splits: dict[str, str] = {}
@@ -116,11 +120,13 @@ def split(
                 hint = did_you_mean(run, names) or "."
                 raise LogError(f"{name}.runs: no run {run!r}{hint} The runs are {listed(names)}")
             if run in splits:
-                raise LogError(f"run {run!r} is in {splits[run]} and in {name}, expected in one")
+                raise LogError(
+                    f"run {run!r} is in {splits[run]} and in {name}, expected in only one of them"
+                )
             splits[run] = name
     free = [run for run in names if run not in splits]
     drawn_parts = {"test": test.runs, "validation": validation.runs}
-    counts = {name: runs if isinstance(runs, int) else 0 for name, runs in drawn_parts.items()}
+    counts = {name: runs for name, runs in drawn_parts.items() if isinstance(runs, int)}
     if (count := sum(counts.values())) >= len(free):
         raise LogError(
             f"{len(free)} runs to choose from, expected more than {count}, or a split by 'seconds'"
@@ -148,14 +154,14 @@ def _cut(
     for name, seconds in parts.items():
         if seconds is None:
             continue
-        # From the row at or before the border, so that the stretch is not a row too short.
+        # Start at or before the border, so that the stretch is not a row too short.
         first = int(np.searchsorted(t, end - seconds - lead, side="right")) - 1
         border = end - seconds - guard
         if border <= t[0]:
-            raise LogError(f"{recording.place}: too short to keep {seconds} s for {name}")
+            raise LogError(f"{recording.place}: the run is too short for {seconds} s of {name}")
         stretches.append((name, recording.rows(slice(max(first, 0), last))))
         before = int(np.searchsorted(t, end - seconds, side="right")) - 1
         end, last = border, min(int(np.searchsorted(t, border, side="right")) + 1, before)
-    # The row after the border only completes a stretch that is measured from its end.
+    # Training ends before the border; the row after it only completes a stretch of the other parts.
     train = recording.rows(slice(0, max(last - 1, 1))) if stretches else recording
     return [*stretches, ("train", train)]

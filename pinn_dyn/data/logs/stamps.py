@@ -1,4 +1,4 @@
-"""Time of the rows of a log: columns of numbers, dates or times of day, or a rate."""
+"""Times of the rows of a log, from columns of numbers, dates or times of day, or from a rate."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from pinn_dyn.data.logs.table import Table
 
 SAMPLE_TIMES = (1e-5, 0.5)
 """Plausible sample times, s."""
-_SINCE_1970 = 1e8  # s; later times count from 1970, and are counted from the first
-_COUNTERS = (2**16, 2**32)  # values of a counter of 16 or 32 bits
-_CYCLES = (86400, 2**32 * 1e-3, 2**32 * 1e-6)  # s, of a day and of milliseconds and microseconds
-_WRAP_SAMPLES = 10  # longest step over the end of a counter
+_SINCE_1970 = 1e8  # smallest time that counts from 1970, s
+_COUNTERS = (2**16, 2**32)  # numbers of values of counters with 16 and 32 bits
+_CYCLES = (86400, 2**32 * 1e-3, 2**32 * 1e-6)  # a day; 32 bits of milli- and microseconds, s
+_WRAP_SAMPLES = 10  # longest step across the end of a counter, in usual sample times
 
 
 @dataclass(config=STRICT)
 class Clock(Columns):
-    """Time of the rows: the sum of columns, or a rate.
+    """Times of the rows: the sum of columns, or a rate.
 
         t_k = Σ_i sign_i scale_i factor(unit_i) (raw_ki - offset_i)    or    t_k = k / rate
 
     Dates, times of day and durations, as text or as types of pandas, need no unit. A counter that
-    overflows is unwrapped. A column that repeats a single number is the sample time.
+    overflows is unwrapped. A column with a single repeated number is the sample time.
 
     Args:
-        columns: columns of the time, such as seconds and nanoseconds; also a name of the index of
-            a data frame, or ``index``.
+        columns: columns of the time, such as seconds and nanoseconds; or a name of the index of a
+            data frame, or ``index``.
         unit: unit of numbers.
-        rate: samples per second of a log without time, Hz; takes the place of the columns.
+        rate: samples per second of a log without time, Hz; replaces the columns.
     """
 
     columns: Annotated[list[str], PerColumn] = field(default_factory=list)
@@ -59,9 +59,9 @@ class Clock(Columns):
         return ", ".join(self.columns)
 
     def seconds(self, table: Table, origin: Table | None = None) -> tuple[np.ndarray, list[str]]:
-        """Return the times of the rows of a run, ``(T,)``, s, and notes on them.
+        """Return the times of the rows of a run, ``(T,)``, s, and notes.
 
-        Times since 1970 count from the first row of ``origin``, by default the table.
+        Times since 1970 are relative to the first row of ``origin``, by default of the table.
         Differences of integers are exact.
         """
         if self.rate is not None:
@@ -85,7 +85,7 @@ class Clock(Columns):
         return t, notes
 
     def plausible_unit(self, table: Table, sample_time: float) -> str:
-        """Return the unit that turns an implausible sample time, s, into a usual one, or ""."""
+        """Return a unit that makes an implausible sample time, s, plausible, or ""."""
         if len(self.columns) > 1 or self._counts(table, self.columns[0])[1]:
             return ""
         counts = sample_time / self.factors[0]
@@ -95,7 +95,7 @@ class Clock(Columns):
         return min(units, key=lambda unit: abs(np.log(100 * usual[unit])), default="")
 
     def _counts(self, table: Table, name: str) -> tuple[np.ndarray, float | None]:
-        """Return a column as numbers ``(T,)``, and the seconds per count of dates and times."""
+        """Return a column as numbers ``(T,)``, and, for dates and times, the seconds per count."""
         try:
             raw = table.column(name, "time")
         except LogError as error:
@@ -125,11 +125,11 @@ class Clock(Columns):
 
 
 def _dates(text: pd.Series) -> pd.Series:
-    """Return texts as dates or as times of day; NaT for texts that are neither."""
+    """Parse texts as dates or as times of day; NaT for texts that are neither."""
     text = text.str.strip().str.replace(r"(:\d\d)(?:,|:(?=\d{3}))(\d+)", r"\1.\2", regex=True)
     trials = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # formats that pandas reads cell by cell
+        warnings.simplefilter("ignore", UserWarning)  # pandas warns of formats without a pattern
         for parse, options in (
             (pd.to_datetime, {"format": "ISO8601", "utc": True}),
             (pd.to_timedelta, {}),
@@ -142,7 +142,7 @@ def _dates(text: pd.Series) -> pd.Series:
 
 
 def _unwrapped(raw: np.ndarray, factor: float) -> tuple[np.ndarray, list[str]]:
-    """Continue a counter where it jumps back by its range, and return a note."""
+    """Unwrap a counter that jumps back by its range, and return a note."""
     back = np.diff(raw) < 0
     if not back.any() or back.all():
         return raw, []

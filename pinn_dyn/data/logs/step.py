@@ -17,10 +17,10 @@ Signals = Sequence[Literal["q", "v", "u"]]
 
 
 class Step(abc.ABC):
-    """One step of the cleaning: maps a recording to recordings and a note for the report.
+    """A cleaning step, which maps a recording to recordings and a note for the report.
 
     Attributes:
-        repairs: faults that the step repairs, and that are then no errors: ``"gaps"``,
+        repairs: faults that the step repairs. The checks do not report them: ``"gaps"``,
             ``"repeated times"``, ``"bursts"``, ``"jumps of q"``.
     """
 
@@ -28,22 +28,22 @@ class Step(abc.ABC):
 
     @abc.abstractmethod
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        """Return the cleaned recordings, and a note on what was done.
+        """Return the cleaned recordings, and a note on the changes.
 
         Raises:
-            LogError: if the step cannot be applied; says what to do first.
+            LogError: if the step cannot be applied. The message names the remedy.
         """
 
     def input_labels(self, labels: list[str]) -> list[str]:
-        """Return names and units of the inputs after the step, from the names before it."""
+        """Return names and units of the inputs after the step, from those before the step."""
         return labels
 
 
 def window_samples(window: Length, recording: Recording, minimum: int, *, odd: bool = False) -> int:
-    """Return a window in samples of a recording, at least ``minimum``; rounds a time.
+    """Convert a window to a number of samples. A time is rounded, to at least ``minimum`` samples.
 
     Raises:
-        LogError: if a number of samples is too small, or even where it must be odd.
+        LogError: if a number of samples is smaller than ``minimum``, or even if it must be odd.
     """
     if isinstance(window, str):
         count = seconds_of("window", window) / float(np.median(np.diff(recording.t)))

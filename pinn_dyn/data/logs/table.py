@@ -1,4 +1,4 @@
-"""A table of a log, and the request of its columns that a reader gets."""
+"""A table of a log, and a request for its columns."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pinn_dyn.wording import did_you_mean
 
 @dataclass(frozen=True)
 class Request:
-    """Columns that a data set needs of a file.
+    """Request for the columns of a file.
 
     Attributes:
         time: first column of the time; empty if the log has a rate instead.
-        columns: all columns, those of the time among them. A reader may return more.
-        max_age: oldest message of another topic of a bag that a row may use, s.
-        sep: separator of the cells of a text file; None detects it.
+        columns: all columns, including those of the time. A reader may return more columns.
+        max_age: largest age of a message of another topic in a row of a bag, s.
+        sep: separator of the cells of a text file; None detects the separator.
         partial: true if the time may be in another file.
     """
 
@@ -57,11 +57,11 @@ class Table:
     """Columns of a log file or of a data frame.
 
     Attributes:
-        frame: the columns; its index names the rows in messages, such as the line in the file.
+        frame: the columns. The index names rows in messages, such as the line in the file.
         name: file or frame, for messages.
-        row: word for a row: ``"line"`` of a text file, ``"row"`` otherwise.
-        notes: remarks of the reader, such as dropped rows.
-        units: texts of the file for the units of columns; they need not be units.
+        row: word for a row in messages: ``"line"`` for text files, otherwise ``"row"``.
+        notes: notes of the reader, such as on dropped rows.
+        units: texts in the file that may be units of columns.
         hint: end of the message about a missing column.
     """
 
@@ -76,11 +76,11 @@ class Table:
         return len(self.frame)
 
     def select(self, rows: np.ndarray) -> Table:
-        """Return the rows of a mask or of positions."""
+        """Return the rows of a mask or of indices."""
         return replace(self, frame=self.frame.iloc[rows])
 
     def place(self, row: int, column: str = "", signal: str = "") -> str:
-        """Name a cell: file, row, column and the signal that reads it."""
+        """Return a description of a cell: file, row, column and signal."""
         text = f"{self.name}, {self.row} {self.frame.index[row]}"
         text += f", column {column!r}" if column else ""
         return text + (f" ({signal})" if signal else "")
@@ -90,10 +90,10 @@ class Table:
         return name in self.frame.columns or name in index
 
     def column(self, name: str, signal: str) -> pd.Series:
-        """Return one column, or a level of the index, as it is."""
+        """Return a column, or a level of the index, without conversion."""
         count = list(self.frame.columns).count(name)
         matches = self.frame.loc[:, self.frame.columns == name]
-        if any(not matches.iloc[:, 0].equals(other) for _, other in matches.items()):
+        if any(not matches.iloc[:, 0].equals(match) for _, match in matches.items()):
             raise LogError(f"{self.name}: {count} columns have the name {name!r}")
         if not count and name in self:
             index = self.frame.index
@@ -105,7 +105,7 @@ class Table:
         return matches.iloc[:, 0]
 
     def numbers(self, columns: Sequence[str], signal: str) -> np.ndarray:
-        """Return columns as finite numbers, ``(T, K)``, NaN for empty cells."""
+        """Return columns as finite numbers, ``(T, K)``, with NaN for empty cells."""
         values = np.empty((len(self), len(columns)))
         for k, name in enumerate(columns):
             values[:, k] = self._numbers(name, signal)
@@ -123,7 +123,7 @@ class Table:
         return values
 
     def runs(self, column: str | None, name: str) -> dict[str, np.ndarray]:
-        """Return the rows of each run, masks ``(T,)``; of one ``name`` without column."""
+        """Return a mask ``(T,)`` of rows for each run; without a column, a single run ``name``."""
         if column is None:
             return {name: np.ones(len(self), dtype=bool)}
         names = self.column(column, "trajectory")
@@ -135,6 +135,6 @@ class Table:
 
 
 def alternates(x: np.ndarray) -> bool:
-    """Return true for numbers ``(T,)`` that go to and fro, as those of two sources by turns."""
+    """Return true for numbers ``(T,)`` that alternate between two sources."""
     one_row, two_rows = (float(np.median(np.abs(x[n:] - x[:-n]))) for n in (1, 2))
     return one_row > 0.02 * np.ptp(x) and two_rows < 0.2 * one_row

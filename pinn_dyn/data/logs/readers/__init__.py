@@ -34,7 +34,7 @@ from pinn_dyn.data.logs.table import Request, Table
 Reader = Callable[[Path, Request], "pd.DataFrame | Table | Mapping[str, pd.DataFrame | Table]"]
 """Function that reads a file, or the runs of a file by name.
 
-One row per sample; the index names a row in messages.
+A table has a row per sample. Messages name rows by the index of the table.
 """
 
 READERS: dict[str, Reader] = {
@@ -49,7 +49,7 @@ READERS: dict[str, Reader] = {
     ".parquet": read_parquet,
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
-"""Reader of each suffix; the folder of a ROS 2 bag is read as ``.db3``."""
+"""Reader of each suffix. The folder of a ROS 2 bag is read as ``.db3``."""
 
 
 _PACKED = (".zip", ".tar", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst")
@@ -60,10 +60,10 @@ def _is_bag(path: Path) -> bool:
 
 
 def read_tables(path: Path, request: Request) -> dict[str, Table]:
-    """Read a log file; return its table under the name ``""``, or a table per run.
+    """Read a log file. Return its table under the name ``""``, or a table per run.
 
     Raises:
-        LogError: if no reader knows its format, or it is damaged or empty.
+        LogError: if no reader knows the format, or the file is damaged or empty.
     """
     suffix = ".db3" if _is_bag(path) else path.suffix.lower().replace(".active", ".bag")
     if suffix not in READERS:
@@ -84,32 +84,35 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
         raise LogError(f"{path}: cannot be read as {suffix}, {cause} {text}") from error
     tables = content if isinstance(content, Mapping) else {"": content}
     if not any(map(len, tables.values())):
-        raise LogError(f"{path}: has no rows")
-    return {
-        run: x
-        if isinstance(x, Table)
-        else Table(x, f"{path}{run and f', run {run}'}", notes=x.attrs.get("notes", ()))
-        for run, x in tables.items()
-        if len(x)
-    }
+        raise LogError(f"{path}: the file has no rows")
+    return {run: _table(path, run, x) for run, x in tables.items() if len(x)}
+
+
+def _table(path: Path, run: str, content: pd.DataFrame | Table) -> Table:
+    if isinstance(content, Table):
+        return content
+    name = f"{path}, run {run}" if run else str(path)
+    return Table(content, name, notes=content.attrs.get("notes", ()))
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
-    """Return the files of names or glob patterns in a folder, or of absolute paths, in order.
+    """Return the sorted files that match names or glob patterns in a folder, or absolute paths.
 
     Raises:
         LogError: if the folder does not exist, or a pattern matches nothing.
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
-        raise LogError(f"root is {str(folder.absolute())!r}, which is no folder (PINN_DYN_LOGS)")
+        raise LogError(
+            f"root is {str(folder.absolute())!r}, which is no folder (default: PINN_DYN_LOGS)"
+        )
     files: set[Path] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         matches = []
         start = Path(pattern).expanduser()
-        names = start.relative_to(start.anchor)  # of an absolute path, from its root on
+        names = start.relative_to(start.anchor)  # a pattern below the root of an absolute path
         for path in (folder / start.anchor).glob(str(names)):
-            parts = [*path.glob("*.mcap"), *path.glob("*.db3")]  # of a bag without metadata
+            parts = [*path.glob("*.mcap"), *path.glob("*.db3")]  # files of a bag without metadata
             matches += [path] if path.is_file() or _is_bag(path) else parts
         if not matches:
             present = listed(sorted(path.name for path in folder.iterdir()))
@@ -121,7 +124,7 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
 
 
 def run_name(path: Path, root: str) -> str:
-    """Return the name of a file's run: its path in the folder or its name, without suffix."""
+    """Return the name of a run: the file's path in the folder, or its name, without suffix."""
     folder = Path(root).expanduser()
     inside = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
     return (inside.with_suffix("") if inside.suffix == ".gz" else inside).with_suffix("").as_posix()

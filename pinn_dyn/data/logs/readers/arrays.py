@@ -1,8 +1,8 @@
-"""Files of arrays as tables: MATLAB, HDF5, NumPy and PyTorch.
+"""Read files of arrays as tables: MATLAB, HDF5, NumPy and PyTorch.
 
-An array with as many rows as the time is a column; a matrix is the columns ``name_1``, ``name_2``
-and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q`` in HDF5. Groups
-that are runs have the columns ``data/*/q``.
+An array with as many rows as the time is a column; a matrix gives the columns ``name_1``,
+``name_2`` and so on. Names of fields are joined: ``log.q`` in MATLAB, ``log/q`` in HDF5. If groups
+are runs, the columns are ``data/*/q``.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from pinn_dyn.data.logs.readers.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional, vector_columns
 from pinn_dyn.wording import did_you_mean
 
-_KINDS = "fiubmMUTO"  # of arrays that may be columns
+_KINDS = "fiubmMUTO"  # kinds of arrays that may be columns
 _RATE = re.compile(r"(^|[._@/])(fs|fps|hz|(sampl\w*?)?_?(rate|freq\w*)(_hz)?)$", re.IGNORECASE)
 
 
 def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
-    """Read a MATLAB file; the fields of a struct are ``name.field``."""
+    """Read a MATLAB file. The fields of a struct are ``name.field``."""
     h5py = optional("h5py", path)
     if h5py.is_hdf5(path):  # version 7.3
         with h5py.File(path, "r") as file:
@@ -43,9 +43,9 @@ def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
 
 
 def read_hdf5(path: Path, request: Request) -> dict[str, pd.DataFrame]:
-    """Read an HDF5 file. Data sets that lie in other files are not opened.
+    """Read an HDF5 file. Data sets in other files are not opened.
 
-    An attribute is a scalar, ``obs@fps``.
+    The attribute ``fps`` of ``obs`` is the scalar ``obs@fps``.
     """
     h5py = optional("h5py", path)
     with h5py.File(path, "r") as file:
@@ -58,7 +58,7 @@ def read_hdf5(path: Path, request: Request) -> dict[str, pd.DataFrame]:
 
 
 def _data_sets(path: Path, h5py: Any, file: Any, columns: Collection[str]) -> dict[str, Any]:
-    """Return the plain data sets; refuse columns whose values lie in other files."""
+    """Return the plain data sets. Raise an error if values of a column lie in other files."""
     plain: dict[str, Any] = {}
     outside: list[str] = []
 
@@ -80,26 +80,26 @@ def _data_sets(path: Path, h5py: Any, file: Any, columns: Collection[str]) -> di
 
 
 def read_npz(path: Path, request: Request) -> dict[str, pd.DataFrame]:
-    """Read an NPZ file. One with Python objects is refused, never unpickled."""
+    """Read an NPZ file. Files with Python objects are rejected, never unpickled."""
     with np.load(path, allow_pickle=False) as file:
         return _tables(path, request, dict(file))
 
 
 def read_npy(path: Path, request: Request) -> dict[str, pd.DataFrame]:
-    """Read a matrix with the columns ``0``, ``1`` and so on, or a structured array by its names."""
+    """Read a matrix with the columns ``0``, ``1`` and so on, or a structured array with names."""
     return _of_python(path, request, np.load(path, allow_pickle=False))
 
 
 def read_torch(path: Path, request: Request) -> dict[str, pd.DataFrame]:
-    """Read a file of ``torch.save``: a matrix, a dictionary of tensors, or a list of these: runs.
+    """Read a file of ``torch.save``: a matrix, a dictionary of tensors, or a list of such runs.
 
-    Other objects are refused, never unpickled.
+    Files with other objects are rejected, never unpickled.
     """
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
     except pickle.UnpicklingError as error:
         raise LogError(
-            f"{path}: holds Python objects, which are not loaded: save plain tensors, as in "
+            f"{path} contains Python objects, which are not loaded: save plain tensors, as in "
             "torch.save({'t': t, 'q': q, 'u': u}, path)"
         ) from error
     return _of_runs(path, request, content)
@@ -108,8 +108,8 @@ def read_torch(path: Path, request: Request) -> dict[str, pd.DataFrame]:
 def read_json(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """Read JSON: a mapping of arrays, a list of such runs, or a list of records.
 
-    A record is a mapping of the numbers of a row. A file ``.jsonl`` has one in each line. Nested
-    mappings are joined, as ``state.q``. Vectors of records are the columns ``q_1``, ``q_2``.
+    A record is a mapping with the numbers of a row. A file ``.jsonl`` has a record per line. Keys
+    of nested mappings are joined: ``state.q``. Vectors give the columns ``q_1``, ``q_2``.
     """
     text = path.read_text(encoding="utf-8-sig")
     lines = text.splitlines() if path.suffix.lower() == ".jsonl" else []
@@ -136,7 +136,7 @@ def read_json(path: Path, request: Request) -> dict[str, pd.DataFrame]:
 
 
 def _records(content: Any, columns: Collection[str], prefix: str = "") -> tuple[str, Any]:
-    """Return the list of records that holds the columns, below keys of mappings, and its prefix."""
+    """Return the list of records with the columns, and the prefix of its nested keys."""
     if not isinstance(content, Mapping):
         return prefix, content
     for key, value in content.items():
@@ -150,7 +150,7 @@ def _records(content: Any, columns: Collection[str], prefix: str = "") -> tuple[
 
 
 def _of_runs(path: Path, request: Request, content: Any) -> dict[str, pd.DataFrame]:
-    """Return the tables of a mapping of arrays, or of those of a list of runs."""
+    """Return the tables of a mapping of arrays, or of a list of such mappings, the runs."""
     if not isinstance(content, list):
         return _of_python(path, request, content)
     tables = [_of_python(path, request, values) for values in content]
@@ -166,7 +166,7 @@ def _of_python(path: Path, request: Request, content: Any) -> dict[str, pd.DataF
 
 
 def _nested(name: str, content: Any) -> Iterator[tuple[str, Any]]:
-    """Return the arrays of nested mappings, as ``name.name``."""
+    """Yield the arrays of nested mappings with joined names, such as ``log.q``."""
     if isinstance(content, Mapping):
         for key, value in content.items():
             yield from _nested(f"{name}.{key}".strip("."), value)
@@ -183,8 +183,8 @@ def _tables(path: Path, request: Request, variables: Mapping[str, Any]) -> dict[
 def _runs(variables: Mapping[str, Any], request: Request) -> dict[str, dict[str, Any]]:
     """Return the variables of each run.
 
-    A run is a text that stands for the ``*`` of the columns, a number k of arrays ``t_k``, ``q_k``,
-    or an entry of arrays ``(runs, T, N)``, or ``(T, runs, N)`` if they are smooth along T.
+    A run is a text in place of the ``*`` of the columns, a number k of arrays ``t_k``, ``q_k``, or
+    an entry of arrays ``(runs, T, N)``, or ``(T, runs, N)`` if they are smooth along T.
     """
     runs: dict[str, dict[str, Any]] = {}
     if stars := [x.split("*") for x in request.columns if "*" in x]:
@@ -197,47 +197,52 @@ def _runs(variables: Mapping[str, Any], request: Request) -> dict[str, dict[str,
     first = re.compile(rf"{re.escape(request.time)}_(\d+)")
     numbers = [match[1] for match in map(first.fullmatch, variables) if match]
     if request.time not in variables and numbers:
-        ends = {run: f"_{run}" for run in numbers}
-        return {
-            run: {x.removesuffix(end): y for x, y in variables.items() if x.endswith(end)}
-            for run, end in ends.items()
-        }
-    bases = (y for x in request.columns for y in (x, x.rpartition("_")[0]) if y in variables)
-    stacked = [x for x in bases if len(variables[x].shape) == 3 and min(variables[x].shape) > 1]
+        for run in numbers:
+            end = f"_{run}"
+            runs[run] = {x.removesuffix(end): y for x, y in variables.items() if x.endswith(end)}
+        return runs
+    bases = [_base(column, variables) for column in request.columns]
+    shapes = {base: variables[base].shape for base in bases if base}
+    stacked = [base for base, shape in shapes.items() if len(shape) == 3 and min(shape) > 1]
     if not stacked:
         return {"": dict(variables)}
     rough = [_roughness(variables[stacked[0]], axis) for axis in (0, 1)]
     before_run = (slice(None),) * (rough[0] < 0.5 and rough[1] > 1)
-    stacks = {variables[x].shape[:2] for x in stacked}
-    return {
-        str(k): {
-            x: y[(*before_run, k)] if y.shape[:2] in stacks else y for x, y in variables.items()
-        }
-        for k in range(next(iter(stacks))[len(before_run)])
-    }
+    stacks = {shapes[base][:2] for base in stacked}
+    constant = {name: value for name, value in variables.items() if value.shape[:2] not in stacks}
+    varying = {name: value for name, value in variables.items() if name not in constant}
+    for k in range(next(iter(stacks))[len(before_run)]):
+        runs[str(k)] = constant | {x: y[(*before_run, k)] for x, y in varying.items()}
+    return runs
+
+
+def _base(column: str, variables: Mapping[str, Any]) -> str:
+    """Return the variable of a column: ``q``, or ``q`` for ``q_1``; "" without a variable."""
+    names = (column, column.rpartition("_")[0])
+    return next((name for name in names if name in variables), "")
 
 
 def _roughness(x: Any, axis: int) -> float:
-    """Return the second differences of an array over its first, which are small along the time."""
+    """Return the ratio of second to first differences of an array, which is small along time."""
     steps = np.diff(x, axis=axis)
     total = np.abs(steps).sum() if x.shape[axis] > 9 else 0.0
     return float(np.abs(np.diff(steps, axis=axis)).sum() / total) if total else np.inf
 
 
 def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) -> pd.DataFrame:
-    """Return the vectors and matrices that have as many rows or columns as the time.
+    """Return a table of the vectors and matrices that have as many rows or columns as the time.
 
-    The time is a vector, a column of a matrix, or a scalar: the sample time.
+    The time is a vector, a column of a matrix, or a scalar, the sample time.
 
     Raises:
-        LogError: without the time, or if a column of the request is complex or has another length.
+        LogError: if the time is missing, or a requested column is complex or has another length.
     """
     arrays = {name: _matrix(value) for name, value in _fields(variables) if value.size}
     names = dict.fromkeys(filter(None, [request.time, *request.columns]))
-    bases = {x: next((y for y in (x, x.rpartition("_")[0]) if y in arrays), "") for x in names}
+    bases = {name: _base(name, arrays) for name in names}
     lengths = [max(arrays[base].shape) for base in bases.values() if base]
     longest = next((length for length in lengths if length > 1), 0)
-    samples = longest - 1 if 1 < longest - 1 in lengths else longest  # N + 1 states of N steps
+    samples = longest - 1 if 1 < longest - 1 in lengths else longest  # N steps have N + 1 states
     columns: dict[str, Any] = {}
     for name, value in arrays.items():
         if value.ndim == 2 and {samples, longest} & {*value.shape} and value.dtype.kind in _KINDS:
@@ -256,8 +261,8 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
                 setting = wording.entry("time", {"rate": scalars[name]})
                 problem = f"{name} is a rate: write {setting}."
         elif name not in columns and base:
-            problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
-            problem += f"real numbers in {samples} rows."
+            problem = f"{name!r} has type {arrays[base].dtype} and shape {arrays[base].shape}, "
+            problem += f"expected real numbers in {samples} rows."
         elif name not in columns and name == request.time and not request.partial:
             runs = (re.sub(rf"\d+([_./]{re.escape(name)})$", r"*\1", x) for x in arrays)
             run = next((f", write {x!r}, and so on." for x in runs if "*" in x), ".")
@@ -273,7 +278,7 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
 
 
 def _fields(variables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Return the variables by name; of a compound data set its fields, ``log/q``."""
+    """Yield the variables by name; for a compound data set its fields, such as ``log/q``."""
     for name, value in variables.items():
         if value.dtype.names:
             yield from ((f"{name}/{field}".strip("/"), value[field]) for field in value.dtype.names)
@@ -282,9 +287,9 @@ def _fields(variables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _matrix(value: Any) -> Any:
-    """Return an array without axes of length 1 beyond two; a vector is a column."""
+    """Return an array as a matrix, with vectors as columns; arrays of more axes unchanged."""
     if value.size > max(value.shape, default=1) and len([n for n in value.shape if n > 1]) > 2:
-        return value  # images and the like are not read
+        return value  # not a column, for example images
     array = np.asarray(value[()])
     array = array.squeeze() if array.ndim > 2 else array
     if array.dtype.kind in "SO":

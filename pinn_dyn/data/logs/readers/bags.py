@@ -1,8 +1,8 @@
-"""Bags of ROS 1 and ROS 2 and MCAP files as tables, without ROS.
+"""Read bags of ROS 1 and ROS 2 and MCAP files as tables, without ROS.
 
 A column is ``<topic>/<field>``, as ``/joint_states/position/panda_joint1`` or ``/commands/data/2``.
-``<topic>/t`` is the time of a message, s: that of its header, or when the bag received it. A row is
-a message of one topic, with empty cells for the columns of other topics.
+``<topic>/t`` is the time of a message in s, from its header, or otherwise the time of receipt. A
+row is a message of a single topic. The columns of all other topics have empty cells.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from pinn_dyn.data.logs.table import Request, Table, alternates
 
 # Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
 _NAMES = ("name", "joint_names", "interface_names")
-_LATEST = 1.0  # s; a message that is later than this begins a new run
-_REGULAR = 0.05  # share of messages that come early, of one publisher
-_FEW = 20  # messages from which two publishers can be told
+_LATEST = 1.0  # longest step back in time within a run, s
+_REGULAR = 0.05  # largest share of early messages of a single publisher
+_FEW = 20  # smallest number of messages that distinguishes two publishers
 _RECEIVED = ""  # column of the times of receipt
 
 
 def read_bag(path: Path, request: Request) -> Table:
-    """Read columns of a bag, one row per message."""
+    """Read columns of a bag, with a row per message."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
@@ -57,7 +57,7 @@ def read_bag(path: Path, request: Request) -> Table:
 def _decode(
     path: Path, columns: Sequence[str], max_age: float, notes: list[str]
 ) -> list[pd.DataFrame]:
-    """Return the values of each topic, on the clock of the first if the stamps are of several."""
+    """Return the values of each topic, on the clock of the first topic if the clocks differ."""
     with open_bag(path) as bag:
         kinds = listed(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
         fields = _fields_of_topics(path, sorted(bag.topics, key=len, reverse=True), columns, kinds)
@@ -91,9 +91,9 @@ def _decode(
 def _topic(
     path: Path, topic: str, columns: list[str], rows: np.ndarray, kinds: str, notes: list[str]
 ) -> pd.DataFrame:
-    """Return the values of a topic by the times of its messages, with their times of receipt."""
+    """Return the values of a topic by the times of its messages, and the times of receipt."""
     stamps, received = rows[:, :2].astype(float).T
-    # In a simulation 0 is the first time.
+    # Stamps 0 are missing stamps, except in a simulation, where 0 is the first time.
     zero = (stamps == 0) & (stamps[stamps > 0].min(initial=np.inf) > _LATEST)
     if zero.all():
         notes.append(f"the stamps of {topic} are 0: its times are those of receipt")
@@ -108,11 +108,9 @@ def _topic(
     values = content.astype(float)
     for k, column in enumerate(columns):
         field = column.rpartition("/")[2]
-        names = (
-            [{*x} for x in joints]
-            if not field.isdigit()
-            else [{*x[int(field) : int(field) + 1]} for x in joints[~foreign]]
-        )
+        names = [{*x} for x in joints]
+        if field.isdigit():
+            names = [{*x[int(field) : int(field) + 1]} for x in joints[~foreign]]
         joined = sorted(set().union(*names))
         if missing[:, k].all():
             short = field in joined or not joined
@@ -124,8 +122,8 @@ def _topic(
                 f"measure it. Choose another signal, such as commands; the bag has {kinds}"
             )
         if field.isdigit() and len(joined) > 1:
-            turns = f"is of {listed(joined)} by turns"
-            raise LogError(f"{path}: {column!r} {turns}: write {column[: -len(field)]}{joined[0]}")
+            name = f"{column[: -len(field)]}{joined[0]}"
+            raise LogError(f"{path}: {column!r} belongs to {listed(joined)} by turns: write {name}")
     publishers, orders = _publishers(publishers, joints, times)
     usual = pd.Series(publishers[~foreign]).mode()[0]
     for reason, mask in (
@@ -141,8 +139,8 @@ def _topic(
         measured = {"position", "velocity"} & set(name.split("/"))  # commands may alternate
         if measured and alternates(frame[name].to_numpy()):
             raise LogError(
-                f"{path}: {name!r} goes to and fro from message to message: two nodes publish "
-                f"{topic}, and the bag does not record which. Stop or remap one, and record again"
+                f"{path}: {name!r} alternates from message to message: two nodes publish {topic}, "
+                "and the bag does not record which. Stop or remap a node, and record again"
             )
     return frame
 
@@ -150,10 +148,10 @@ def _topic(
 def _publishers(
     publishers: np.ndarray, joints: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, str]:
-    """Return numbers of the publishers of messages, and the orders of joints that tell them apart.
+    """Return the number of the publisher of each message, and a note on the orders of joints.
 
-    Nodes that share a connection are told apart by the order of the joints, if the messages of one
-    order come at regular times, and those of all do not.
+    Nodes with the same connection are distinguished by the order of their joints, if messages with
+    the same order come at regular times, and all messages together do not.
     """
     orders = list(dict.fromkeys(x for x in joints if x))
     numbers = np.array([orders.index(x) if x else 0 for x in joints])
@@ -168,13 +166,13 @@ def _publishers(
 
 
 def _early(times: np.ndarray) -> float:
-    """Return the share of messages that follow within half of the usual time."""
+    """Return the share of messages that come within half of the usual time."""
     spacing = np.diff(np.sort(times))
     return float((spacing < np.median(spacing) / 2).mean())
 
 
 def _merged(topics: Sequence[pd.DataFrame], last: str) -> pd.DataFrame:
-    """Return all rows by their times in each run; at equal times those of ``last`` are last."""
+    """Sort all rows by their times in each run. At equal times, rows with ``last`` come last."""
     frame = pd.concat(topics).sort_values(_RECEIVED, kind="stable")
     run = np.cumsum(np.diff(frame.index, prepend=frame.index[0]) < -_LATEST)
     return frame.iloc[np.lexsort((frame[last].notna(), frame.index, run))]
@@ -183,7 +181,7 @@ def _merged(topics: Sequence[pd.DataFrame], last: str) -> pd.DataFrame:
 def _fields_of_topics(
     path: Path, topics: Sequence[str], columns: Sequence[str], kinds: str
 ) -> dict[str, dict[str, str]]:
-    """Return the field of each column by its topic; the longest topic that fits."""
+    """Return the field of each column, by topic. The topic is the longest match."""
     fields: dict[str, dict[str, str]] = {}
     for column in columns:
         topic = next((name for name in topics if column.startswith(f"{name}/")), None)
@@ -202,7 +200,7 @@ def _seconds(time: Any) -> float | None:
 
 
 def _stamp(message: Any) -> float | None:
-    """Return the time of a message, s, from its header or ``timestamp``; None without."""
+    """Return the time of a message, s, from its header or ``timestamp``, or None."""
     header = getattr(message, "header", None)
     return _seconds(getattr(header, "stamp", getattr(message, "timestamp", None)))
 
@@ -215,7 +213,7 @@ def _number(message: Any, field: str, location: str) -> float | None:
     parents: list[Any] = []
     name = ""
     for step in field.split("/"):
-        name = f"{name}/{step}".lstrip("/")  # of a joint, with slashes
+        name = f"{name}/{step}".lstrip("/")  # names of joints may have slashes
         parents.insert(0, node)
         if hasattr(node, "__len__") and not isinstance(node, str):
             k = int(name) if name.isdigit() else _index(name, node, parents)
@@ -238,7 +236,7 @@ def _number(message: Any, field: str, location: str) -> float | None:
 
 
 def _index(name: str, node: Any, parents: Sequence[Any]) -> int:
-    """Return the position of a name among those beside an array or in its elements."""
+    """Return the index of a name in the names beside an array or in its elements."""
     return next((list(x).index(name) for x in _names(node, parents) if name in x), len(node))
 
 
@@ -248,7 +246,7 @@ def _names(node: Any, parents: Sequence[Any]) -> list[Any]:
 
 
 def _paths(node: Any, parents: Sequence[Any] = ()) -> list[str]:
-    """Return the paths of the numbers of a message, with the names of entries."""
+    """Return the paths of all numbers in a message, with the names of entries."""
     if isinstance(node, (int, float, np.number)):
         return [""]
     if isinstance(node, (str, bytes)) or callable(node) or _seconds(node) is not None:

@@ -1,8 +1,9 @@
-"""Variables of a MATLAB file by the names that MATLAB gives them.
+"""Read the variables of a MATLAB file, by their names in MATLAB.
 
-A field of a struct is ``log.q``, an element of a struct array ``trial(2).q``, a cell
-``train{2}.q``. A table has its columns, a timetable also ``TT.Time``. A ``timeseries`` has ``Time``
-and ``Data``; a signal of a Simulink data set has the name of its element, ``logsout.q.Data``.
+A field of a struct is ``log.q``, an element of a struct array ``trial(2).q``, and a cell
+``train{2}.q``. A table has its columns; a timetable also has ``TT.Time``. A ``timeseries`` has
+``Time`` and ``Data``. A signal of a Simulink data set has the name of its element,
+``logsout.q.Data``.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ def matlab_variables(path: Path) -> dict[str, Any]:
     """Read the arrays of a MATLAB file, of any version, by their full names."""
     matio = optional("matio", path)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of objects without numbers
+        warnings.simplefilter("ignore")  # warnings about objects without numbers
         content = matio.load_from_mat(str(path))
     return {name: x for key, value in content.items() for name, x in _leaves(key, value)}
 
 
 def elements(variables: Mapping[str, Any], columns: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the variables of each element of the struct or cell arrays that hold the columns.
+    """Return the variables of each element of the struct or cell arrays with the columns.
 
-    An element is a run, and its variables have names without an index, ``trial.q``.
+    An element is a run. The names of its variables have no index, such as ``trial.q``.
     """
     runs: dict[str, dict[str, Any]] = {}
     for name, value in variables.items():
@@ -54,7 +55,7 @@ def elements(variables: Mapping[str, Any], columns: Sequence[str]) -> dict[str, 
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Return the arrays of a variable with their full names."""
+    """Yield the arrays of a variable with their full names."""
     if isinstance(value, pd.DataFrame):
         if isinstance(value.index, pd.DatetimeIndex | pd.TimedeltaIndex):
             yield f"{name}.{value.index.name}", value.index.to_numpy()
@@ -81,21 +82,21 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _axes(signals: np.ndarray, samples: int) -> np.ndarray:
-    """Return the signals of all axes of a Scope side by side, ``(T, K)``."""
+    """Return the signals of all axes of a Scope in a matrix, ``(T, K)``."""
     values = [np.squeeze(x) for x in signals["values"].flat]
     rows = [x if len(x) == samples else x.T for x in values]
     return np.column_stack(rows)
 
 
 def _element(name: str, item: Any) -> str:
-    """Return the name of an element of a data set; "" for other elements."""
+    """Return the name of an element of a data set, or "" for any other element."""
     properties = getattr(item, "properties", None) or {}
     label = np.ravel(properties.get("Name", "")).tolist() if "Values" in properties else []
     return f"{name}.{label[0]}" if any(label) else ""
 
 
 def _properties(value: Any) -> Mapping[str, Any]:
-    """Return the properties of an object; of a time series its times and data."""
+    """Return the properties of an object; for a time series, its times and data."""
     properties: Mapping[str, Any] = value.properties or {}
     if value.classname != "timeseries":
         return properties

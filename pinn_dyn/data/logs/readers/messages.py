@@ -1,11 +1,12 @@
-"""Decoded messages of bags: of ROS 1 and ROS 2 by rosbags, of MCAP files by mcap.
+"""Decode the messages of bags: ROS 1 and ROS 2 by rosbags, MCAP files by mcap.
 
-MCAP files may hold messages of ROS, JSON or protobuf. A file that a crashed recorder left without
-its end is read up to there.
+MCAP files may contain messages of ROS, JSON or protobuf. A file without an end, as after a crash of
+the recorder, is read up to the damage.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +25,10 @@ Message = tuple[str, int, int, Any]
 
 
 class Bag(NamedTuple):
-    """Types of messages by topic, iterator over messages, and remarks, complete after it."""
+    """Types of messages by topic, iterator over messages, and notes.
+
+    The notes are complete after the iteration.
+    """
 
     topics: dict[str, str]
     messages: Callable[[Sequence[str]], Iterator[Message]]
@@ -59,9 +63,9 @@ def _rosbag(path: Path) -> Iterator[Bag]:
 
 @contextmanager
 def _with_storage(path: Path) -> Iterator[Path]:
-    """Yield the folder of a bag, or a copy of links whose metadata name the storage.
+    """Yield the folder of a bag, or a folder of links with corrected metadata.
 
-    A recorder that was reindexed may leave its identifier empty.
+    The metadata of a reindexed bag may have an empty identifier of the storage.
     """
     metadata = path / "metadata.yaml"
     text = metadata.read_text() if metadata.is_file() else ""
@@ -79,7 +83,7 @@ def _with_storage(path: Path) -> Iterator[Path]:
 
 
 def _up_to_damage(messages: Iterator[_Item], notes: list[str]) -> Iterator[_Item]:
-    """Yield messages up to a damaged one, which is noted; the first one must be readable."""
+    """Yield messages up to a damaged message and add a note. The first must be readable."""
     try:
         yield next(messages)
     except StopIteration:
@@ -120,7 +124,7 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
     """Return the function that decodes the messages of a channel of an MCAP file."""
     encoding = channel.message_encoding
     if encoding == "json":
-        return lambda data: json.loads(data, object_hook=lambda x: SimpleNamespace(**x))
+        return functools.partial(json.loads, object_hook=lambda x: SimpleNamespace(**x))
     if encoding == "protobuf":
         descriptors = optional("google.protobuf.descriptor_pb2", path)
         factory = optional("google.protobuf.message_factory", path)
@@ -147,7 +151,10 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
 
 
 def _common_types(path: Path) -> Any:
-    """Return the types of ROS 2, which old bags do not define, and of ``*/msg/*.msg`` beside it."""
+    """Return the types of ROS 2, which old bags do not define, and those of ``*/msg/*.msg`` files.
+
+    The files lie beside the bag.
+    """
     types = optional("rosbags.typesys", path)
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)
     for file in (path if path.is_dir() else path.parent).glob("*/msg/*.msg"):

@@ -1,7 +1,7 @@
-"""Text files of motion capture: several header rows become a header and a row of units.
+"""Convert the header rows of motion-capture files to a header and a row of units.
 
-The files repeat the names X, Y and Z below the names of markers, rigid bodies and segments. Here a
-column is ``marker:X``. A name that occurs again gets a number, ``marker:X #2``.
+The files repeat the names X, Y and Z below the names of markers, rigid bodies and segments. The
+converted column is ``marker:X``. Repeated names get a number, ``marker:X #2``.
 
 - OptiTrack Motive: rows Type, Name, ID and Parent above the quantity and the axis. Rotations of
   rigid bodies are ``body:rotation X``.
@@ -24,10 +24,9 @@ _AXES = ("X", "Y", "Z")
 
 
 def one_header(text: str, requested: Collection[str]) -> tuple[str, float]:
-    """Return a text file with one header, on the same lines; other files as they are.
+    """Return a text file with a single header and the same lines; other files unchanged.
 
-    The second result is the rate of the frames that Vicon and Qualisys state, Hz; 0 if there is
-    none.
+    The second result is the rate of the frames in a file of Vicon or Qualisys, Hz; otherwise 0.
 
     Args:
         text: the file.
@@ -105,7 +104,7 @@ def _with_header(
     units: Sequence[str],
     separator: str,
 ) -> str:
-    """Return the lines with the rows from ``first`` on below one header and a row of units."""
+    """Return the lines with a header and a row of units above the rows from ``first`` on."""
     counts: dict[str, int] = {}
     unique = []
     for name in names:

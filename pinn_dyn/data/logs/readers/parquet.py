@@ -1,7 +1,7 @@
-"""Parquet files as tables, LeRobot's among them.
+"""Read Parquet files as tables, including data sets of LeRobot.
 
-Entries of a vector are ``action_1``, ``action_2`` and so on, with LeRobot also ``action/shoulder``
-by the names in ``meta/info.json``. Fields of a struct are ``state.q``.
+Entries of a vector are ``action_1``, ``action_2`` and so on. With LeRobot, they also have the names
+in ``meta/info.json``, ``action/shoulder``. Fields of a struct are ``state.q``.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from pinn_dyn.data.logs.table import Request, optional, vector_columns
 
 
 def read_parquet(path: Path, request: Request) -> pd.DataFrame:
-    """Read a Parquet file; the index of a data frame is a column.
+    """Read a Parquet file. The index of a data frame is a column.
 
     Raises:
-        LogError: if LeRobot's names of a vector are asked for and do not fit its width.
+        LogError: if LeRobot's names of a vector are requested and do not match its length.
     """
     content = optional("pyarrow.parquet", path).ParquetFile(path).read()
     while any(str(kind).startswith("struct") for kind in content.schema.types):

@@ -1,8 +1,8 @@
-"""Text files of numbers: encoding, separator, decimal mark, header and units are detected.
+"""Read text files of numbers; detect encoding, separator, decimal mark, header and units.
 
-The separator and the decimal mark are the pair with which the rows hold the largest number of
-numbers. The header is the line above the numbers that names the largest number of requested
-columns. Columns of a file without a header are ``0``, ``1``, ``2`` and so on.
+Separator and decimal mark are the pair with the largest count of numbers in the rows. The header is
+the line above the numbers with the largest count of requested columns. Columns of a file without a
+header are ``0``, ``1``, ``2`` and so on.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import itertools
 import re
 import warnings
 from collections import Counter
@@ -25,11 +26,11 @@ from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.readers.motion_capture import one_header
 from pinn_dyn.data.logs.table import Request, Table, vector_columns
 
-_SAMPLE = 300  # lines from which the dialect and the header are detected
-_BLOCK = 1 << 24  # bytes that are parsed at once
-_FOOTER = 20  # lines at the end that may be no rows
+_SAMPLE = 300  # number of lines for the detection of the dialect and the header
+_BLOCK = 1 << 24  # number of bytes that are parsed at once
+_FOOTER = 20  # largest number of lines after the last row
 _COMMENTS = ("#", "%", "//")
-_NO_VALUES = ["-", "--", "nan(ind)", "-nan(ind)"]  # beside those of pandas
+_NO_VALUES = ["-", "--", "nan(ind)", "-nan(ind)"]  # in addition to those of pandas
 _MISSING = {"", "nan", "na", "n/a", "null", "none", *_NO_VALUES}
 _NUMBERS = {
     mark: rf"[+-]?(?:\d+[{mark}]?\d*|[{mark}]\d+)(?:[eE][+-]?\d+)?|[+-]?inf|true|false"
@@ -49,7 +50,7 @@ class _Dialect(NamedTuple):
     width: int
 
     def cells(self, line: str, separator: str = "") -> list[str]:
-        """Return the cells of a line; one or several blanks are the separator ``" "``."""
+        """Return the cells of a line. Several blanks count as a single separator ``" "``."""
         separator = separator or self.separator
         if separator == " ":
             line = re.sub(r"[ \t]+", " ", line.strip(" \t"))
@@ -57,13 +58,15 @@ class _Dialect(NamedTuple):
         return [cell.strip() for cell in row]
 
     def numeric(self, line: str) -> list[bool | None]:
-        """Tell for each cell of a line whether it is a number or a vector; None if it is empty."""
-        return [
-            None
-            if cell.lower() in _MISSING
-            else any(x.fullmatch(cell) for x in (_NUMBER[self.decimal], _VECTOR))
-            for cell in self.cells(line)
-        ]
+        """Return true for each cell of a line with a number or a vector, None for empty cells."""
+        number = _NUMBER[self.decimal]
+
+        def kind(cell: str) -> bool | None:
+            if cell.lower() in _MISSING:
+                return None
+            return bool(number.fullmatch(cell) or _VECTOR.fullmatch(cell))
+
+        return list(map(kind, self.cells(line)))
 
 
 def read_text(path: Path, request: Request) -> Table:
@@ -71,14 +74,14 @@ def read_text(path: Path, request: Request) -> Table:
 
     Args:
         path: the file; UTF-8, UTF-16 with a byte order mark, or Windows-1252.
-        request: columns that tell the header from text above it, and the separator if it is known.
+        request: requested columns, which identify the header, and the separator if known.
 
     Raises:
-        LogError: if no line holds numbers, or rows are longer than the header.
+        LogError: if no line contains numbers, or rows are longer than the header.
     """
     blocks = _blocks(path)
     text, rate = one_header(next(blocks, ""), request.columns)
-    if rate or text.startswith("\n"):  # the header of motion capture changes the lines
+    if rate or text.startswith("\n"):  # converting a header of motion capture changes the lines
         text, rate = one_header("".join([*_blocks(path)]), request.columns)
         blocks = iter(())
     brackets = bool(_BARE_BRACKETS.search(text, 0, 10_000))
@@ -105,28 +108,27 @@ def read_text(path: Path, request: Request) -> Table:
     if rate and _FRAME in frame:
         frame, notes = _of_frames(frame, rate, notes)
     units = _units(lines[header + 1 : start], dialect, names)
-    hint = "" if header >= 0 else ": it has no header, so its columns are numbered from 0."
+    hint = "" if header >= 0 else ": the file has no header, so columns are numbered from 0."
     return Table(frame, str(path), "line", notes, units, hint)
 
 
 def _blocks(path: Path) -> Iterator[str]:
-    """Yield the text of a file in blocks of whole lines, which take little memory each."""
+    """Yield the text of a file in blocks of whole lines, to save memory."""
     with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-        rest = file.read(_BLOCK)
-        if rest[:2] in (b"\xff\xfe", b"\xfe\xff") or rest[1:2] == b"\0":
-            rest += file.read()  # lines of UTF-16 have no simple end
-            yield _decoded(rest).replace("\r\n", "\n").replace("\r", "\n")
+        content = file.read(_BLOCK)
+        if _is_utf16(content):
+            yield _decoded(content + file.read())  # a line break has no unique byte
             return
-        while rest:
+        while content:
             block = file.read(_BLOCK)
-            end = rest.rfind(b"\n") + 1 if block else len(rest)
+            end = content.rfind(b"\n") + 1 if block else len(content)
             if end:
-                yield _decoded(rest[:end]).replace("\r\n", "\n").replace("\r", "\n")
-            rest = rest[end:] + block
+                yield _decoded(content[:end])
+            content = content[end:] + block
 
 
 class _Body:
-    """Rows of a text file, parsed in blocks; only the numbers of each are kept."""
+    """Rows of a text file, parsed in blocks. Only the numbers of a block are stored."""
 
     def __init__(self, dialect: _Dialect, names: Sequence[str], header: str, start: int):
         self._dialect, self._width, self._header = dialect, len(names), header
@@ -152,17 +154,17 @@ class _Body:
         try:
             frame = self._parsed(text, first if not self._parts else 0)
         except (pd.errors.ParserError, pd.errors.ParserWarning):
-            frame = self._parsed(text, first)  # the message names the line of the file
+            frame = self._parsed(text, first)  # now the message has the line number in the file
         frame.index = pd.RangeIndex(first + 1, len(frame) + first + 1)
         frame = frame.dropna(how="all")
         self._rows.append(frame.index.to_numpy())
         self._parts.append({k: frame[k].to_numpy() for k in frame})
 
     def _parsed(self, text: str, above: int) -> pd.DataFrame:
-        """Parse lines below a number of others, which are empty: quotes may be unbalanced there."""
+        """Parse lines below ``above`` empty lines, which keep the line numbers in messages."""
         separator = self._dialect.separator
         with warnings.catch_warnings():
-            # pandas would cut rows that are longer than the header, and only warn.
+            # By default, pandas cuts rows that are longer than the header, and only warns.
             warnings.simplefilter("error", pd.errors.ParserWarning)
             return pd.read_csv(
                 io.BytesIO(("\n" * above + text).encode()),
@@ -179,7 +181,7 @@ class _Body:
             )
 
     def frame(self) -> pd.DataFrame:
-        """Return all rows; each column takes its memory once."""
+        """Return all rows. Parsed blocks are released, so that each column is stored once."""
         columns = {
             k: np.concatenate([part.pop(k) for part in self._parts]) for k in range(self._width)
         }
@@ -187,12 +189,12 @@ class _Body:
         return pd.DataFrame(columns, index=index, copy=False)
 
     def all_notes(self) -> list[str]:
-        """Return what was repaired."""
+        """Return notes on repairs of the file."""
         text = f"{self._repeats} lines that repeat the header are dropped: a restarted recorder?"
         return [text] * bool(self._repeats) + self._notes
 
     def _without_end(self, text: str, before: int) -> str:
-        """Return the lines without a last one that is cut short."""
+        """Return the lines without incomplete lines at the end."""
         end = text.rsplit("\n", _FOOTER)
         widths = [len(self._dialect.cells(line)) for line in end[:0:-1]]
         short = next((k for k, width in enumerate(widths) if width >= self._dialect.width), 0)
@@ -201,8 +203,8 @@ class _Body:
         text = "\n".join(end[:-short])
         first = before + text.count("\n") + 2
         self._notes.append(
-            f"{short} lines from line {first} on are dropped, they are shorter than the rows, as "
-            f"is {end[-1][:80]!r}"
+            f"{short} lines from line {first} on are dropped, since they are shorter than the "
+            f"rows, such as {end[-1][:80]!r}"
         )
         return text
 
@@ -210,7 +212,7 @@ class _Body:
 def _of_frames(
     frame: pd.DataFrame, rate: float, notes: list[str]
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Return the rows with their time by the numbers of the frames, and a note on missing ones."""
+    """Return the rows with times from the frame numbers, and notes on missing frames."""
     numbers = frame[_FRAME].to_numpy(float)
     missing = np.flatnonzero(np.diff(numbers) > 1)
     if len(missing):
@@ -222,17 +224,23 @@ def _of_frames(
     return frame, notes
 
 
+def _is_utf16(content: bytes) -> bool:
+    return content[:2] in (b"\xff\xfe", b"\xfe\xff") or content[1:2] == b"\0"
+
+
 def _decoded(content: bytes) -> str:
-    if content[:2] in (b"\xff\xfe", b"\xfe\xff") or content[1:2] == b"\0":
-        return content.decode("utf-16")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("cp1252")
+    if _is_utf16(content):
+        text = content.decode("utf-16")
+    else:
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("cp1252")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _dialect(lines: Sequence[str], separator: str | None) -> _Dialect | None:
-    """Return the dialect with which rows of equal width hold the largest number of numbers."""
+    """Return the dialect with the largest count of numbers in rows of equal width."""
     scores: Counter[_Dialect] = Counter()
     for decimal in ".,":
         for mark in [separator] if separator else ",;\t| ":
@@ -245,15 +253,15 @@ def _dialect(lines: Sequence[str], separator: str | None) -> _Dialect | None:
     if not scores:
         return None
     best = max(scores, key=lambda dialect: scores[dialect])
-    rows = [cells for line in lines if len(cells := best.cells(line)) == best.width]
-    filled_columns = [k for k in range(best.width) if any(row[k] for row in rows)]
-    return best._replace(width=filled_columns[-1] + 1)  # rows may end in a separator
+    rows = [row for row in map(best.cells, lines) if len(row) == best.width]
+    columns = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
+    return best._replace(width=columns[-1] + 1)  # rows may end in a separator
 
 
 def _header(
     lines: Sequence[str], dialect: _Dialect, requested: Collection[str]
 ) -> tuple[list[str], int, int]:
-    """Return the names of the columns, the line of the header or -1, and the first row."""
+    """Return the names of the columns, the line of the header (or -1), and the first row."""
     rows = [dialect.numeric(line)[: dialect.width] for line in lines]
     full = [row for row in rows if len(row) == dialect.width]
     columns = [k for k, x in enumerate(zip(*full, strict=True)) if 2 * x.count(False) < len(x)]
@@ -262,15 +270,15 @@ def _header(
         cells = [rows[k][n] for n in columns if n < len(rows[k])]
         if len(cells) < len(columns) or not any(cells) or False in cells:
             return False
-        matches = {*dialect.cells(lines[k])} & {*requested}  # names of columns may be numbers
+        matches = {*dialect.cells(lines[k])} & {*requested}  # a header may consist of numbers
         return len(matches) < 2 or all(name.isdigit() for name in matches)
 
     first = next((k for k in range(len(rows)) if is_row(k)), len(rows))
     names = [str(k) for k in range(dialect.width)]
     best = (len({*names} & {*requested}), False, False, False, -1)
     for k, line in enumerate(lines[:first]):
-        bare = [line.lstrip(" \t#%/")] if _comment(line) else []
-        for candidate in [names for text in (line, *bare) for names in _names(text, dialect)]:
+        texts = [line, line.lstrip(" \t#%/")] if _comment(line) else [line]
+        for candidate in itertools.chain.from_iterable(_names(text, dialect) for text in texts):
             matches = len({*candidate} & {*requested})
             exact = len(candidate) == dialect.width
             is_units = not any(known_unit(cell) is None for cell in candidate if cell)
@@ -281,7 +289,7 @@ def _header(
     names[0] = names[0] or "index"
     numbers = dialect.cells("".join(lines[first : first + 1]))
     if header < 0 and dialect.width > 1 and numbers == names:
-        header, first = first, first + 1  # pandas numbers columns without names
+        header, first = first, first + 1  # the first row is a header of numbers by pandas
     return names, header, first
 
 
@@ -290,7 +298,7 @@ def _comment(line: str) -> bool:
 
 
 def _names(line: str, dialect: _Dialect) -> list[list[str]]:
-    """Return the names that a header would hold, by the separators that it may have."""
+    """Return the possible names in a header line, for each possible separator."""
     cells = re.findall(r'"[^"]*"|[^\s\[(]+(?:[ \t]*[\[(][^\])]*[\])])?', line)
     splits = [dialect.cells(line, mark) for mark in (dialect.separator, *",;\t|") if mark != " "]
     splits.append([word.strip('"') for word in cells])
@@ -301,15 +309,16 @@ def _names(line: str, dialect: _Dialect) -> list[list[str]]:
 
 
 def _units(lines: Sequence[str], dialect: _Dialect, names: Sequence[str]) -> dict[str, str]:
-    """Return the units of columns in their names, ``q [deg]``, or in a line below the header."""
-    units = {name: match[1] for name in names if (match := re.search(r"[\[(](\D*)[\])]$", name))}
+    """Return the units of columns from names such as ``q [deg]``, or lines below the header."""
+    matches = {name: re.search(r"[\[(](\D*)[\])]$", name) for name in names}
+    units = {name: match[1] for name, match in matches.items() if match}
     for line in lines:
         units |= dict(zip(names, dialect.cells(line.strip().lstrip("#%/ ")), strict=False))
     return units
 
 
 def _with_vectors(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Name the columns; a column of vectors becomes ``name_1``, ``name_2`` and so on."""
+    """Name the columns. A column of vectors becomes ``name_1``, ``name_2`` and so on."""
     columns: dict[int, pd.Series] = {}
     labels: list[str] = []
     for name, (_, column) in zip(names, frame.items(), strict=True):
