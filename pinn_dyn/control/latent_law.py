@@ -122,7 +122,7 @@ class LatentLaw(Stage):
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the memory at rest under the input u: x, d, q_s, u_d, z_d and past inputs."""
-        past = (x.repeat(*[1] * (x.ndim - 1), self.model.past_steps) for x in (q, u))
+        past = (x.repeat(*[1] * (x.ndim - 1), self.model.history_steps) for x in (q, u))
         x = self.model.start(q, v, u, *past)[..., : 2 * len(self.model.bias)]
         z_d = self._first_target.expand(*x.shape[:-1], -1)
         d = q - self.model.observe(x)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from pinn_dyn.mechanics import Predictor, Signal
 
-_SHARED = ("num_coordinates", "num_inputs", "state", "fixed_step", "past_steps", "input_history")
+_SHARED = ("num_coordinates", "num_inputs", "state", "fixed_step", "history_steps", "input_history")
 
 
 class Ensemble(Predictor):
@@ -40,7 +40,7 @@ class Ensemble(Predictor):
                     "same settings but the seed"
                 )
         self.members = nn.ModuleList(models)
-        self.past_steps, self.input_history = first.past_steps, first.input_history
+        self.history_steps, self.input_history = first.history_steps, first.input_history
 
     @property
     def fixed_step(self) -> float | None:  # type: ignore[override]

@@ -106,7 +106,7 @@ def predict_trajectories(
         span = f"step is {step}" if window is None else f"window is {window}"
         raise ValueError(f"{span} s, but the trajectories last only {truth.duration:g} s")
     starts = slice(0, last, samples)
-    x0 = truth.states(model.state, starts, model.past_steps, stride).double()
+    x0 = truth.states(model.state, starts, model.history_steps, stride).double()
     input = truth.since(model.input_history).input
     past = input.t.shape[0] - truth.t.shape[0]
     input = input.part(slice(past + last + 1)).to(truth.q.device, torch.float64)

@@ -35,7 +35,7 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
     """
     n, m = model.num_coordinates, model.num_inputs
     sizes = {"q": n, "v": n, "a": n, "u": m, "u_next": m, "h": None}
-    past = model.past_steps
+    past = model.history_steps
     sizes |= {"q_past": past * n, "u_past": past * m, "memory": getattr(model, "memory_size", 0)}
     steps = torch.tensor([5e-4, 1.5e-3], dtype=torch.float64)
     states = drawn_states(sizes, {"h": (steps[0], steps[1]), **(ranges or {})})

@@ -28,7 +28,7 @@ class Predictor(nn.Module, abc.ABC):
         fixed_step: step of a discrete-time model in s, or None if any step is possible.
         penalized: true if training adds :meth:`penalty` to the loss.
         input_history: time before the start in which the model uses the input, s.
-        past_steps: number n of earlier q that the model uses, one step apart, the latest first.
+        history_steps: number n of earlier q that the model uses, one step apart, the latest first.
             They follow the state in x0 ``(*batch, 2N + nN)``. If x0 ends with the state, the robot
             is assumed to have been at rest.
         labels, input_labels: name and unit of each coordinate and input, for files, if known.
@@ -38,7 +38,7 @@ class Predictor(nn.Module, abc.ABC):
     fixed_step: float | None = None
     penalized: bool = False
     input_history: float = 0.0
-    past_steps: int = 0
+    history_steps: int = 0
     labels: Sequence[str] = ()
     input_labels: Sequence[str] = ()
     dead_time: ArrayLike = 0.0
@@ -70,7 +70,7 @@ class Predictor(nn.Module, abc.ABC):
             ValueError: if a size is wrong, times do not increase, or the state is not finite.
         """
         size = 2 * self.num_coordinates
-        past = self.past_steps * self.num_coordinates if x0.shape[-1] > size else 0
+        past = self.history_steps * self.num_coordinates if x0.shape[-1] > size else 0
         require_last_dim("x0", x0, size + past, "2N")
         require_last_dim("u", input.u, self.num_inputs, "M")
         require_start(x0, t, input)

@@ -109,7 +109,7 @@ class EncodedPredictor(Predictor):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs)
         self.input_history = history
-        self.past_steps = n = int(history / statistics.step + 1e-6)
+        self.history_steps = n = int(history / statistics.step + 1e-6)
         for name, values in zip(("mean", "std"), statistics.network_input(1), strict=True):
             q, v, u = values.float().split([size, size, inputs])
             self.register_buffer(name, torch.cat([q, v, *[q] * n, *[u] * (n + 1)]))
@@ -195,7 +195,7 @@ class EncodedPredictor(Predictor):
             ValueError: if the spacing of ``t`` is not the step of the training windows.
         """
         self._require_step(t)
-        size, n = self.num_coordinates, self.past_steps
+        size, n = self.num_coordinates, self.history_steps
         before = t[0] - self.step.to(t) * torch.arange(n + 1, device=t.device)
         at_rest = [x0[..., :size]] * n  # replaces a missing past, and is cut off otherwise
         u_past = input.at(before).to(x0)

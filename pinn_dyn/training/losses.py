@@ -120,7 +120,7 @@ class IncrementLoss(WindowLoss):
         return windows.first(self.curriculum[min(int(progress * stages), stages - 1)])
 
     def forward(self, model: Predictor, windows: Windows) -> Tensor:
-        start = windows.start(model.state, model.past_steps)
+        start = windows.start(model.state, model.history_steps)
         predicted = model.increments(start, windows.t, windows.input)
         return self.error(predicted[..., 1:, :], windows.increments(model.state))
 

@@ -480,7 +480,7 @@ def test_an_interrupted_training_ends_with_one_line(tmp_path):
 
 def test_a_model_with_a_memory_trains_on_windows_with_a_past(caplog):
     run = fit(model="subnet", steps=2)
-    assert run.model.past_steps > 1
+    assert run.model.history_steps > 1
     assert run.config["model_name"] == "subnet"
     assert "the model sees" not in caplog.text
     short = partial(DynamicsData, pairs=8, batch_size=8, steps=1, stride=1, history=0.5)

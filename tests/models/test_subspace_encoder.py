@@ -88,7 +88,7 @@ def test_evaluation_and_training_hand_over_the_past(model):
         expected = by_hand(model, q, v, u, k, 5)
         assert_near(found[k - 9 : k - 4], torch.from_numpy(expected[1:, :2]), 1e-6)
     windows = draw_windows([whole], count=40, steps=2, stride=stride, seed=0, history=3 * STEP)
-    start = windows.start("qv", model.past_steps)
+    start = windows.start("qv", model.history_steps)
     states = model.predict(start, windows.t, windows.input)
     checked = 0
     for k in range(3, 18):
@@ -112,7 +112,7 @@ def test_without_a_past_the_robot_was_at_rest(model):
 
 def test_the_history_has_all_steps_that_fit():
     statistics = dataclasses.replace(make_statistics(2, 2), step=0.1)
-    assert SubspaceEncoder(statistics, history=0.3).past_steps == 3  # 0.3 / 0.1 is below 3
+    assert SubspaceEncoder(statistics, history=0.3).history_steps == 3  # 0.3 / 0.1 is below 3
 
 
 def test_weights_with_one_time_constant_are_loaded(model):

@@ -204,9 +204,9 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
             f"{windows.history} s: set data.history={model.input_history}"
         )
     steps = len(windows.windows.t) - 1
-    if model.past_steps > 20 * steps:
+    if model.history_steps > 20 * steps:
         log.warning(
-            f"the model sees {model.past_steps} steps of {windows.step:g} s before windows of "
+            f"the model sees {model.history_steps} steps of {windows.step:g} s before windows of "
             f"{steps} steps: increase data.stride or data.steps, or reduce model.history"
         )
 
