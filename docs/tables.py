@@ -187,7 +187,7 @@ def windows() -> str:
         data = task(f"{log}, windows")
         data = pd.concat([data, task(log).query("model == 'known'")])
         for count, runs in data.groupby("pairs"):
-            spread = runs[LONG].max() - runs[LONG].min()
+            spread = (runs[LONG].max() - runs[LONG].min()) or float("nan")
             text = f"{count:.0f}" + (" (auto)" if "known" in runs.index else "")
             means = [number(runs[name].mean(), digits=3) for name in columns]
             rows.append([log, text, *means[:2], number(spread), *means[2:]])

@@ -102,7 +102,8 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
         return Calibration(_LEVELS, share)
     floor, corrected = corrected_width(validation, _LEVELS)
     errors = standardized_errors(held_out, floor).flatten().numpy()
-    means = [float(_widths(validation, x).nanmean()) for x in (floor, 0.0)]
+    widths = [_widths(validation, x) for x in (floor, 0.0)]
+    means = [float(x[x.isfinite()].mean()) for x in widths]
     factor = corrected[_AT] * means[0] / (width[_AT] * max(means[1], _SMALLEST))
     return Calibration(_LEVELS, share, _within(errors, corrected), float(factor))
 
