@@ -18,8 +18,8 @@ from pinn_dyn.data.logs import (
 )
 from pinn_dyn.data.logs.check.checks import _are_ticks
 from pinn_dyn.data.logs.registers import rows_before_first_sample
-from pinn_dyn.log_check.check import check
 from pinn_dyn.log_check.chain import SIGN
+from pinn_dyn.log_check.check import check
 from tests.data.logs_files import motion, source, write
 
 RESAMPLE = {"resample": Resample(rate=100.0, max_gap=0.2)}
