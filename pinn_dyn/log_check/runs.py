@@ -305,7 +305,7 @@ def equations_of_motion(
     elif bodies is not None and size == n:
         x = chain_columns(data, bodies)
         first = x.shape[2] - OWN * n + OWN * np.arange(n)  # of each joint
-        friction, damping = first[:, None] + [3, 4, 5], first + 2
+        friction, damping = first[:, None] + [4, 5, 6], first + 3
         equations = [
             _equation(data, x, data.u, u.columns, window, range(n), friction.tolist(), damping)
         ]
