@@ -24,8 +24,8 @@ EXCHANGED = "residual of the inputs as logged over that with two of them exchang
 """Name of the measurement that judges the order of the inputs."""
 FRICTION = "power of the friction over that of the forces"
 """Name of the measurement that judges the direction of the time."""
-OWN = 6
-"""Columns of each joint of its own: offset, spring, damping, and three of dry friction."""
+OWN = 7
+"""Columns of each joint of its own: offset, spring, rotor, damping, and three of dry friction."""
 _LARGEST = 4  # chain of unknown bodies
 _ROWS = 1500
 _RIDGE = 1e-9
@@ -102,7 +102,7 @@ def chain_columns(data: Averages, regressor: Regressor) -> np.ndarray:
     n = data.q.shape[1]
     own = np.zeros((len(data), n, n, OWN))
     for k in range(n):
-        parts = [np.ones(len(data)), data.q[:, k], data.v[:, k], data.sign[:, k]]
+        parts = [np.ones(len(data)), data.q[:, k], data.a[:, k], data.v[:, k], data.sign[:, k]]
         parts += [data.slow_sign[:, k], data.slow_sign[:, n + k]]
         own[:, k, k] = np.column_stack(parts)
     bodies = regressor(data.q, data.v, data.a)
@@ -191,7 +191,8 @@ class Readings:
             self.regressor(data.q, 0 * data.v, 0 * data.a + x)[:, k] @ theta
             for k, x in enumerate(np.eye(n))
         ]
-        inertia = np.stack(pushed, axis=1) - at_rest
+        rotors = self.theta[-OWN * n :, h].reshape(n, OWN)[:, 2]
+        inertia = np.stack(pushed, axis=1) - at_rest + rotors
         left = self.y[:, :, h] - chain_columns(data, self.regressor) @ self.theta[:, h]
         noise = 2 * (left * data.moving).std(axis=0)
         smallest = np.maximum(noise, _NOTICEABLE * self.y[:, :, h].std(axis=0))
@@ -214,7 +215,7 @@ class Readings:
         n, v = self.data.q.shape[1], self.data.v
         x, theta = chain_columns(self.data, self.regressor), self.theta[:, h].copy()
         own = theta[-OWN * n :].reshape(n, OWN)
-        own[:, :2] = 0.0  # offset and spring
+        own[:, :3] = 0.0  # offset, spring and rotor
         theta[: -OWN * n] = 0.0
         force = np.abs(self.y[:, :, h] * v).mean(axis=0).clip(min=1e-300)
         return np.asarray((x @ theta * v).mean(axis=0) / force)

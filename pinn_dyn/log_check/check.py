@@ -305,7 +305,7 @@ def _motions(
     width, chain = max(x.width for x in widths), chain_regressor(source.q.units)
     results: list[Motion | None] = []
     least = np.inf
-    for bodies in (rigid if exact else chain, None):
+    for bodies in dict.fromkeys([rigid if exact else chain, None]):
         motions = [equations_of_motion(x, source.q, source.u, width, bodies) for x in widths]
         left = np.inf if motions[0] is None else float(np.median(motions[0].usual()))
         if not results or left < least / 2:

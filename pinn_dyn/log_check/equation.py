@@ -16,7 +16,6 @@ GROUPS = 10
 _RIDGE = 1e-9
 _RICH = 3  # independent rows at least for a term of a rich equation
 _MOST = 400  # terms, for the time that a regression takes
-_ITERATIONS = 7  # of reweighted least squares
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ class EquationOfMotionRegression:
     Every question to a log is a choice of y, X and w. With inverse dynamics, y is a force u(t - d)
     and X holds terms of q, v and a (:func:`terms`, or the regressor of rigid bodies) and of dry
     friction; the delay, a drift of the clock or a saturation is the candidate y with the smallest
-    residual, a bad run is one whose blocks have a large residual, and a coefficient is the dry
-    friction or the effective inertia of a joint. With more inputs than coordinates, y is v or a.
+    residual, and a coefficient is the dry friction of a joint. With more inputs than coordinates,
+    y is v or a.
     Fits need the inner products of columns alone, which are summed once for each block.
 
     Args:
@@ -106,43 +105,11 @@ class EquationOfMotionRegression:
             totals * scale**2,
         )
 
-    def robust_weights(
-        self, y: str, x: Sequence[str], base: np.ndarray, start: np.ndarray
-    ) -> np.ndarray:
-        """Return weights ``(1, B)`` that are small for blocks that disagree with most others.
-
-        The fits are reweighted with the loss of Geman and McClure (1985), from the weights ``base``
-        ``(B,)``, and from the blocks of the mask ``start``, whose residual is the usual one.
-        """
-        weights = start.astype(float)
-        for cut in 0.5 ** np.arange(1, _ITERATIONS + 1):
-            residual = self.residuals(self.fit(y, x, (weights * base)[None]))
-            usual = np.median(residual[start], axis=0).clip(min=1e-3)
-            worst = (residual / usual).max(axis=1)
-            weights = 1 / (1 + (worst / max(2.5, cut * worst.max())) ** 2) ** 2
-        return (weights * base)[None]
-
     def held_out(self, y: str, x: Sequence[str]) -> np.ndarray:
         """Return the squares of each block that a fit to the other blocks leaves, ``(B, K)``."""
         squares = self.fit(y, x, self.jackknife()[1:]).squares
         blocks = np.arange(len(self.numbers))
         return np.asarray(squares[blocks, blocks])
-
-    def spreads(self, totals: np.ndarray) -> np.ndarray:
-        """Return the root mean squares of blocks over the median one, ``(B, K)``."""
-        means = np.sqrt(totals / np.bincount(self.block)[:, None])
-        usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0))
-        return means / usual.clip(min=1e-300)
-
-    def residuals(self, fit: WeightedFit) -> np.ndarray:
-        """Return the residual of each block, ``(B, K)``, as a share of its root mean square of y.
-
-        The share is that of the median block if that block has a larger y.
-        """
-        counts = np.bincount(self.block)[:, None]
-        means = np.sqrt(fit.totals / counts)
-        usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0)).clip(min=1e-300)
-        return np.sqrt(fit.squares[0] / counts) / np.maximum(means, usual)
 
 
 def terms(data: Averages, form: str) -> np.ndarray:

@@ -42,6 +42,7 @@ _ODD = 0.4  # share of odd windows up to which the others tell the right equatio
 _AGREE, _AGREES = 0.4, 0.1  # share of windows that have to agree on an equation; their weight
 _WORSE = 2.0  # residual of an equation over that of another, of a wrong equation
 _UNKNOWN = "is it another payload or unit, or are columns exchanged, reversed or stuck?"
+_WHOLE = 0.7  # share of a run that is all of it
 _UNKNOWN_WINDOWS = 4  # odd windows in a row from which an unknown cause is named
 _CLEAR = 0.9  # correlation from which a scale is clear
 _SCALES = (0.2, 5.0)  # of another load; beyond, another unit
@@ -304,7 +305,7 @@ def equations_of_motion(
     elif bodies is not None and size == n:
         x = chain_columns(data, bodies)
         first = x.shape[2] - OWN * n + OWN * np.arange(n)  # of each joint
-        friction, damping = first[:, None] + [3, 4, 5], first + 2
+        friction, damping = first[:, None] + [4, 5, 6], first + 3
         equations = [
             _equation(data, x, data.u, u.columns, window, range(n), friction.tolist(), damping)
         ]
@@ -409,13 +410,15 @@ def check_runs(
 def _certain(motion: Motion, bad: np.ndarray, odd: np.ndarray) -> bool:
     """Tell whether four bad windows are in a row, and most odd rows are at poses of others.
 
-    Else a force that depends on the position may explain them, such as that of a hose.
+    Else a force that depends on the position may explain them, such as that of a hose, unless all
+    of the run is bad.
     """
-    rows = odd.any(axis=1)[motion.window]
+    rows, of_run = (np.isin(motion.window, np.flatnonzero(x.any(axis=1))) for x in (odd, bad))
+    run = motion.data.run == motion.data.run[of_run][0]
     low, high = motion.data.q[~rows].min(axis=0), motion.data.q[~rows].max(axis=0)
     usual = ((motion.data.q[rows] >= low) & (motion.data.q[rows] <= high)).all(axis=1)
     in_a_row = scipy.ndimage.binary_opening(bad.any(axis=1), np.ones(_UNKNOWN_WINDOWS))
-    return bool(in_a_row.any() and usual.mean() > 0.5)
+    return bool(in_a_row.any() and (usual.mean() > 0.5 or of_run[run].mean() > _WHOLE))
 
 
 def check_rests(

@@ -342,17 +342,19 @@ def _gears(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Itera
         least, offset = _offset(plain, structure, k, factor, joints)
         starts.append((least, k, factor, offset))
     _, k, factor, offset = min(starts)
-    near = np.log(factor) + np.array([-0.3, 0.3])
+    start = np.array([np.log(factor), offset])
     alone = scipy.optimize.minimize_scalar(
-        lambda x: left(k, np.exp(x), 0.0), bounds=near, method="bounded"
+        lambda x: left(k, np.exp(x), 0.0),
+        bounds=(start[0] - 0.3, start[0] + 0.3),
+        method="bounded",
     )
     both = scipy.optimize.minimize(
         lambda x: left(k, np.exp(x[0]), x[1]),
-        [np.log(factor), offset],
+        start,
         method="Nelder-Mead",
         options={
             "maxfev": _TRIALS,
-            "initial_simplex": [np.log(factor), offset] + np.array([[0, 0], [0.15, 0], [0, 0.25]]),
+            "initial_simplex": start + np.array([[0, 0], [0.15, 0], [0, 0.25]]),
         },
     )
     factor, offset = np.exp(both.x[0]), both.x[1]

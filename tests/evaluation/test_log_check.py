@@ -24,7 +24,7 @@ from tests.support.delayed_robots import resting
 RATE = 100.0
 
 
-def driven(delay=0.0, noise=0.0, seconds=60.0, seed=0):
+def driven(delay=0.0, noise=0.0, seconds=60.0, seed=0, held=False):
     """Two masses on springs that random forces move, as a data frame."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(seconds * RATE)) / RATE
@@ -33,7 +33,8 @@ def driven(delay=0.0, noise=0.0, seconds=60.0, seed=0):
     for k in (1, 2):
         knots = rng.normal(size=round((seconds + 4) / 0.2))
         force = np.interp(fine, -2.0 + 0.2 * np.arange(len(knots)), knots)
-        acting = np.interp(fine - delay, fine, force)
+        times = np.floor(fine * RATE + 1e-6) / RATE if held else fine - delay
+        acting = np.interp(times, fine, force)
         q, v, motion = 0.0, 0.0, []
         for f in acting:
             v += 0.001 * (4 * f - 3 * q - 0.8 * v)
@@ -77,7 +78,7 @@ def test_a_good_log_has_no_warning_and_no_step_to_add(good, tmp_path):
     result = checked(good)
     assert set(verdicts(result).values()) == {"ok"}
     assert not result.problems
-    assert result.steps == []
+    assert result.block == ""
     assert "a training makes sense" in str(result)
     page = result.save(tmp_path, "python check.py")
     assert page.stat().st_size > 20_000
@@ -93,6 +94,17 @@ def test_a_delay_is_measured_warned_of_and_given_as_a_step():
     assert result.delay == pytest.approx(0.05, abs=0.006)
     again = checked(driven(delay=0.05, noise=1e-5), delay=result.delay)
     assert again.delay is None
+
+
+def test_forces_that_a_controller_holds_get_the_interpolation_of_the_data_set(language):
+    frame = driven(noise=1e-5, held=True)
+    result = checked(frame)
+    if language == "yaml":
+        entries = yaml.safe_load(result.block)
+    else:
+        entries = eval(f"dict({result.block}\n)")
+    assert entries == {"interpolation": "hold"}
+    assert checked(frame, **entries).block == ""
 
 
 @pytest.mark.parametrize(("dry", "late"), [(0.3, 0), (0.0, 3), (0.3, 3)])
