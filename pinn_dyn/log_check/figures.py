@@ -19,16 +19,18 @@ _DRAWN = 1000  # rows of the equation of motion
 _BINS, _FEWEST = 40, 5  # parts of the range of a state; rows of a part
 
 
-def forces(motion: Motion) -> Figure:
-    """Draw y, X theta and the residual of each equation of motion in the longest run."""
+def forces(motion: Motion, inputs: Sequence[str]) -> Figure:
+    """Draw y, X theta and the residual of each equation of motion in the longest run.
+
+    ``inputs`` are labels of the inputs with their units.
+    """
+    labels = inputs[: len(motion.labels)] if motion.of_forces else motion.labels
     data = motion.data
     rows = np.flatnonzero(data.run == np.bincount(data.run).argmax())[:_DRAWN]
     t = data.t[rows]
     breaks = np.flatnonzero(np.diff(t) > 10 * np.median(np.diff(t))) + 1  # between stretches
     measured, explained = motion.measured()[rows], motion.predicted()[rows]
-    figure, (axes,) = panels(
-        [motion.labels], t, title="Forces and the equation of motion, means removed"
-    )
+    figure, (axes,) = panels([labels], t, title="Forces and the equation of motion, means removed")
     curves = {
         "measured": (measured, TRUTH),
         "explained": (explained, COLORS[0]),

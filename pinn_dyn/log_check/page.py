@@ -211,7 +211,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
     verdict = [paragraph(f"{check.verdict[0].upper()}{check.verdict[1:]}.")]
     if check.motion is not None:
         text = "measured forces, the part that the equation of motion explains, and the residual"
-        verdict += [paragraph(_FORCES), drawing(forces(check.motion), text)]
+        verdict += [paragraph(_FORCES), drawing(forces(check.motion, source.input_labels), text)]
     verdict += [_linked(text) for text in check.findings()]
     if check.block:
         text = "Entries that follow from the measured delay and noise, to append to the data set:"
