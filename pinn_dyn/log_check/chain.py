@@ -16,7 +16,7 @@ import numpy as np
 from pinn_dyn.data.logs import Columns, Measurement
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import Averages
-from pinn_dyn.log_check.equation import Regressor, tenths
+from pinn_dyn.log_check.equation import Regressor, force_columns, tenths
 
 SIGN = "sign of the input"
 """Name of the measurement that judges the sign of an input."""
@@ -274,6 +274,34 @@ class Order(NamedTuple):
         return replace(data, u=data.u[:, order] * factors, inputs=inputs)
 
 
+def single_signs(data: Averages, u: Columns) -> Order:
+    """Look for reversed inputs by the equation of each joint, whose inertia is positive."""
+    data, results = data.thinned(_ROWS), []
+    for k, name in enumerate(u.columns):
+        x = np.hstack([*force_columns(data, k, None).values()])
+        y = data.u[:, k] - np.median(data.u[:, k])
+        mask = data.row_weights()[:, 0] * data.moving[:, k]
+        theta = solve(x * mask[:, None], y * mask)
+        pushed = replace(data, a=data.a + np.eye(data.q.shape[1])[k])
+        inertia = (np.hstack([*force_columns(pushed, k, None).values()]) - x) @ theta
+        smallest = max(2 * np.std((y - x @ theta) * mask), _NOTICEABLE * np.std(y))
+        power = mask * data.u[:, k] * data.v[:, k]
+        positive = float(np.average(inertia > 0, weights=mask.clip(min=1e-300)))
+        reversed_input = (
+            np.std(inertia * data.a[:, k]) > smallest
+            and positive < _NEGATIVE
+            and power.sum() < _POWER * np.abs(power).sum()
+        )
+        text = (
+            f"input {name!r} seems to push joint {k + 1} backwards: its effective inertia is "
+            f"negative, and its mean power {power.sum() / mask.sum():.3g} W: is it reversed?"
+        )
+        sign = -1.0 if reversed_input else 1.0
+        results.append(judged(SIGN, name, sign, "1", sign < 0, text))
+    signs = np.array([measurement.value for measurement in results])
+    return Order(results, list(range(len(signs))), signs, np.ones(len(signs)))
+
+
 def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) -> Order | None:
     """Look for reversed and exchanged inputs by an equation of all joints, with two kernels.
 
@@ -286,11 +314,14 @@ def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) ->
         units: units of the coordinates.
 
     Returns:
-        None for more inputs than joints, too many joints, and inputs that are no forces.
+        None for more inputs than joints, and inputs that are no forces. With more than four joints,
+        the signs are those of :func:`single_signs`.
     """
     regressor, count = chain_regressor(units), len(u.columns)
-    if regressor is None or not 0 < count <= len(units) or not set(u.units) <= _UNITS:
+    if not 0 < count <= len(units) or not set(u.units) <= _UNITS:
         return None
+    if regressor is None:
+        return single_signs(widths[0], u) if count == len(units) else None
     forces, square = set(u.units) <= {"Nm", "N"}, count == len(units)
     readings, again = (Readings(data, regressor, forces=forces) for data in widths)
     likely = np.union1d(readings.likely(), again.likely())
