@@ -184,7 +184,7 @@ def test_two_publishers_that_the_bag_does_not_tell_apart_are_named(tmp_path):
         stamp = START + round(1e9 * time) + 400_000
         items += [(time, message), (time + 4e-4, joint_state(k, stamp=stamp, q=Q[k] + 0.5))]
     write(tmp_path / "bag", items)
-    with pytest.raises(LogError, match=r"two nodes publish /joint_states.*remap one"):
+    with pytest.raises(LogError, match=r"two nodes publish /joint_states.*remap a node"):
         read(tmp_path / "bag")
 
 

@@ -281,7 +281,7 @@ def test_everything_else_imports_without_a_simulator(tmp_path):
             del sys.modules[name]
         for name in ("pybullet", "pybullet_data", "mujoco", "gymnasium"):
             sys.modules[name] = None
-        for name in ("app.train", "run.trainer", "data", "evaluation"):
+        for name in ("app.train", "run.training.trainer", "data", "evaluation"):
             importlib.import_module(f"pinn_dyn.{name}")
         systems = importlib.import_module("pinn_dyn.systems")
         systems.SoftArm()
