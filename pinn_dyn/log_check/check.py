@@ -15,7 +15,7 @@ from pydantic import PositiveFloat
 from pinn_dyn import wording
 from pinn_dyn.data import logs
 from pinn_dyn.data.bandwidth import bandwidth
-from pinn_dyn.data.logs.check.holds import held_rows
+from pinn_dyn.data.logs.check.checks import held_rows
 from pinn_dyn.data.logs.check.plausibility import LOST, STATE
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import round_rate
@@ -41,7 +41,7 @@ from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import residuals
 from pinn_dyn.log_check.input_faults import SATURATED, input_faults
 from pinn_dyn.log_check.numbers import check_angles, check_velocity_lag
-from pinn_dyn.log_check.page import LogCheck
+from pinn_dyn.log_check.page import LogCheck, store, stored
 from pinn_dyn.log_check.runs import (
     Interval,
     Motion,
@@ -49,7 +49,6 @@ from pinn_dyn.log_check.runs import (
     check_runs,
     equations_of_motion,
 )
-from pinn_dyn.log_check.stored import store, stored
 from pinn_dyn.log_check.structure import FIT, compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure

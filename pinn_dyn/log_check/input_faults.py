@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinn_dyn.data.logs import Columns, Measurement, Recording
-from pinn_dyn.data.logs.check.holds import held_rows
+from pinn_dyn.data.logs.check.checks import held_rows
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import Averages
 from pinn_dyn.log_check.delay import FEWEST, DelayCurve, minimum

@@ -1,20 +1,24 @@
-"""Results of the check of a log: measurements, each with a verdict, and their page."""
+"""Results of the check of a log: measurements with verdicts, their page, and stored verdicts."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
 from pinn_dyn import wording
 from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data import logs
-from pinn_dyn.data.logs.measurement import Measurement
+from pinn_dyn.data.logs import LogSource, Measurement
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.report.page import (
     Section,
@@ -28,8 +32,39 @@ from pinn_dyn.evaluation.report.page import (
 )
 from pinn_dyn.identification.rigid_excitation import RigidExcitation
 from pinn_dyn.log_check.delay import DelayCurve
+from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import delay_curves, forces, residuals
 from pinn_dyn.log_check.runs import Motion
+
+
+def store(source: LogSource, rigid: Regressor | None, measurements: Sequence[Measurement]) -> None:
+    """Keep the texts of what is not ok in the cache."""
+    texts = list(dict.fromkeys(x.text for x in measurements if x.verdict != "ok"))
+    path = _path(source, rigid)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json.dumps(texts))
+
+
+def stored(source: LogSource, rigid: Regressor | None) -> list[str] | None:
+    """Return the texts of the last check of the same data and robot; None if there was none."""
+    path = _path(source, rigid)
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def _path(source: LogSource, rigid: Regressor | None) -> Path:
+    """Return the file of a log and a robot: the numbers of both, not their names, are its key."""
+    key = hashlib.sha256(repr([source.labels, source.input_labels]).encode())
+    for part in source.cleaned:
+        for item in part.clean:
+            for values in (item.t, item.q, item.v, item.u):
+                key.update(np.ascontiguousarray(values).tobytes())
+    if rigid is not None:
+        random = np.random.default_rng(0)
+        motion = random.normal(size=(3, 4, len(source.q.columns)))
+        key.update(rigid(*motion).round(9).tobytes())
+    folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser()
+    return folder / f"check-{key.hexdigest()[:16]}.json"
+
 
 _ROWS = 50  # of a table in the terminal
 _HEADS = {  # of options, in Python

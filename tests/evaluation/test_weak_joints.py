@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.identification.weak_joints import weak_joints
+from pinn_dyn.identification.constants import weak_joints
 from pinn_dyn.mechanics import Signal
 from tests.support.known import known_model, motions
 

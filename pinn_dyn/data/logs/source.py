@@ -14,7 +14,7 @@ import pandas as pd
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from pinn_dyn.data.logs.check import plausibility
-from pinn_dyn.data.logs.check.repeats import check_repeats
+from pinn_dyn.data.logs.check.checks import check_repeats
 from pinn_dyn.data.logs.cleaning import clean, long_enough
 from pinn_dyn.data.logs.clock import InputDelay
 from pinn_dyn.data.logs.columns import UNITS, Columns, validated

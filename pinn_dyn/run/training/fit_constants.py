@@ -31,9 +31,9 @@ from pinn_dyn.identification.constants import (
     contradicted,
     far_masses,
     undetermined,
+    weak_joints,
 )
 from pinn_dyn.identification.rigid_excitation import rigid_excitation
-from pinn_dyn.identification.weak_joints import weak_joints
 from pinn_dyn.log_check.check import residual_figure
 from pinn_dyn.mechanics import Predictor, Trajectory, double_copy, stack, stack_until
 from pinn_dyn.models import KnownMechanics, LearnedConstants

@@ -1,8 +1,9 @@
-"""Checks of a log as it is read: its clock, and single rows that no robot can have."""
+"""Checks of a log as it is read: its clock, held values, single rows, and repeated motions."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection
 
 import numpy as np
@@ -12,10 +13,80 @@ from pinn_dyn import wording
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import TRAJECTORY, LogError
 from pinn_dyn.data.logs.measurement import Measurement, judged
-from pinn_dyn.data.logs.recording import burst_steps, clock_steps
+from pinn_dyn.data.logs.recording import Recording, burst_steps, clock_steps
 from pinn_dyn.data.logs.registers import check_registers
 from pinn_dyn.data.logs.stamps import SAMPLE_TIMES, Clock
 from pinn_dyn.data.logs.table import Table, alternates
+
+_FEWEST = 20  # updates
+_REGULAR = 1.5  # long over short distance of two updates
+_TICK = 1.5  # smallest steps, up to which a step is one of an encoder
+
+
+def held_rows(x: np.ndarray) -> int:
+    """Return the rows from one update of columns ``(T, K)`` to the next, 1 if they are not held.
+
+    All columns of a held signal change in the same rows, at regular distances. A slow joint with a
+    coarse encoder changes at times, too, but by one step of the encoder.
+    """
+    steps = np.abs(np.diff(x, axis=0))
+    changes = np.flatnonzero(steps.any(axis=1))
+    spacing = np.diff(changes)
+    if len(spacing) < _FEWEST:
+        return 1
+    short, usual, long = np.percentile(spacing, [10, 50, 90])
+    sizes = steps[changes].max(axis=1)
+    ticks = np.mean(sizes <= _TICK * sizes.min())
+    if short < 2 or long > _REGULAR * short + 1 or ticks > 0.5:
+        return 1
+    return int(usual)
+
+
+_SAME = 0.05  # distance of a repeated motion, as a share of its spread
+
+
+def check_repeats(
+    earlier: list[Recording], pieces: list[Recording], name: str
+) -> list[Measurement]:
+    """Count the rollouts of the split ``name`` that repeat a motion of the splits before it.
+
+    At a shift s, the mean of ‖q(t) - q_earlier(t + s)‖² is below 0.05² times the variance of q.
+    """
+    pairs = Counter(
+        (piece.run, item.run) for piece in pieces for item in earlier if _is_in(piece, item)
+    )
+    title = f"motions of the {name} that repeat one of another split"
+    results = []
+    for (run, original), count in pairs.items():
+        text = (
+            f"{name}: {count} of the motions of {run} repeat one of {original}, of another "
+            "split: keep such runs in one split"
+        )
+        results.append(
+            judged(title, run, count, "0", True, text, section="docs/csv_logs.md#splits")
+        )
+    return results or [judged(title, name, 0, "0", False, "")]
+
+
+def _is_in(piece: Recording, item: Recording) -> bool:
+    cut_out = piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]
+    if cut_out or len(item) < len(piece):
+        return False
+    thin = max(1, len(piece) // 300)
+    q = piece.q[::thin]
+    center = q.mean(axis=0)
+    q = q - center
+    size = (q**2).sum()
+    for start in range(0, thin, max(1, thin // 4)):
+        track = item.q[start::thin] - center
+        if len(track) >= len(q):
+            squares = np.cumsum(np.r_[0.0, (track**2).sum(axis=1)])
+            energy = squares[len(q) :] - squares[: -len(q)]
+            products = scipy.signal.fftconvolve(track, q[::-1], mode="valid", axes=0).sum(axis=1)
+            if (energy - 2 * products + size < _SAME**2 * size).any():
+                return True
+    return False
+
 
 _BURST_TEXT = "its stamps come in bursts: take the times from the rows by RowClock"
 _GAP_FACTOR = 3.0  # sample times from which a distance between rows is a gap

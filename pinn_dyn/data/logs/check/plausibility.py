@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from pinn_dyn import wording
-from pinn_dyn.data.logs.check.holds import held_rows
+from pinn_dyn.data.logs.check.checks import held_rows
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
