@@ -74,7 +74,7 @@ ATTACKS = {
 }
 CASES = [
     pytest.param(attack, seed, marks=pytest.mark.slow if seed not in (1, 6, 11) else ())
-    for seed in (1, 6, 11, *range(30, 40))
+    for seed in (1, 6, 11, 30, 33, 36, 39)
     for attack in ATTACKS
 ]
 

@@ -73,14 +73,14 @@ def test_a_regulator_that_diverges_ends_with_an_error(own_log):
         run("regulator_in_a_loop.py", RUN, "--duration=0.5", "--gains", "1e5", "1e3")
 
 
-@pytest.mark.slow  # a whole training
+@pytest.mark.slow
 def test_the_example_log_determines_a_model_that_controls(home):
-    """The regulator of a training with the defaults of the example holds its set point."""
+    """The regulator holds its set point after a twelfth of the steps of the example."""
     folder = home / "whole_log"  # own_log.py reads the log beside it
     folder.mkdir()
     for name in ("own_log.py", "example_log.csv"):
         shutil.copy(EXAMPLES / name, folder)
-    run(str(folder / "own_log.py"), "--folder", "runs/whole")
+    run(str(folder / "own_log.py"), "--folder", "runs/whole", "--steps", "400")
     for gains in (["2", "0.4"], ["5", "0.4"]):
         text = run("regulator_in_a_loop.py", "runs/whole", "--duration=3", "--gains", *gains)
         errors = re.search(r"final error: \[(.*)\]", text)[1].split()
