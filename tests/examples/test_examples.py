@@ -75,7 +75,7 @@ def test_a_regulator_that_diverges_ends_with_an_error(own_log):
 
 @pytest.mark.slow
 def test_the_example_log_determines_a_model_that_controls(home):
-    """The regulator holds its set point after a twelfth of the steps of the example."""
+    """The regulator holds its set point after 400 of the 1,000 steps of the example."""
     folder = home / "whole_log"  # own_log.py reads the log beside it
     folder.mkdir()
     for name in ("own_log.py", "example_log.csv"):
