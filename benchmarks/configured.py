@@ -6,17 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
 
 from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
-from pinn_dyn.run.configuration.build import (
-    build_part,
-    build_predictor,
-    build_source,
-    model_builder,
-)
+from pinn_dyn.run.configuration.build import build_part, build_source, model_builder
 from pinn_dyn.run.training import prepared, trainer
 from pinn_dyn.training import DynamicsLearner
 
@@ -30,7 +26,8 @@ def build_data(config: dict[str, Any], source: DataSource | None = None) -> Dyna
 
 def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
     """Build the model of a configuration, scaled to the data."""
-    return build_predictor(model_builder(config), statistics, config["seed"])
+    torch.manual_seed(config["seed"])
+    return model_builder(config)(statistics=statistics)
 
 
 def build_validator(config: dict[str, Any], step: float) -> RolloutValidator:
