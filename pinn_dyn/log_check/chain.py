@@ -121,7 +121,7 @@ def _solve(normal: np.ndarray, cross: np.ndarray) -> np.ndarray:
 
 
 class Readings:
-    """Ways to read the inputs of a log, and what an equation of all joints leaves of each.
+    """Ways to read the inputs of a log, and their residuals in one equation of all joints.
 
     A reading says which joint each input drives, and the sign of each input up to a sign of all of
     them. With an input per joint, two inputs may be exchanged. The columns of the equation do not
@@ -134,7 +134,7 @@ class Readings:
 
     Attributes:
         joints, signs: of each input, ``(H, M)``; the first reading is the log.
-        left: share that each reading leaves of held-out data in each tenth, ``(B, H)``.
+        left: unexplained share of each reading on held-out data, by tenth, ``(B, H)``.
         theta: coefficients, ``(P, H)``.
     """
 
@@ -171,10 +171,10 @@ class Readings:
         self.y = y / mask.clip(min=1e-300)[:, :, None]
 
     def likely(self) -> np.ndarray:
-        """Return the numbers of the readings that leave little more than the best one.
+        """Return the numbers of the readings whose residual is close to the smallest.
 
-        A reading leaves far more if it does so on average, and leaves more in most tenths. A
-        reading that explains too little is not likely if another explains enough.
+        A reading is unlikely if its mean residual is four times the smallest and it is larger in
+        most tenths, or if it explains less than half of the inputs and another reading more.
         """
         means = self.left.mean(axis=0)
         wins = (self.left > self.left[:, [means.argmin()]]).mean(axis=0)
@@ -205,7 +205,7 @@ class Readings:
         return -1.0 if low and (positive < _NEGATIVE).all() else 0.0
 
     def unexplained(self, h: int) -> np.ndarray:
-        """Return the share of each left side that a reading leaves, ``(N,)``."""
+        """Return the unexplained share of each left side for a reading, ``(N,)``."""
         left = self.y[:, :, h] - chain_columns(self.data, self.regressor) @ self.theta[:, h]
         squares = (left**2 * self.data.moving).sum(axis=0)
         return squares / (self.y[:, :, h] ** 2 * self.data.moving).sum(axis=0).clip(min=1e-300)
@@ -239,7 +239,7 @@ def _readings(joints: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gains(x: np.ndarray, u: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the sizes of factors of the inputs of which the columns leave least."""
+    """Return the sizes of the gains of the inputs with the smallest residual, ``(M,)``."""
     y = np.zeros((*u.shape, u.shape[1]))
     for k in range(u.shape[1]):
         y[:, k, k] = (u * mask)[:, k]
@@ -258,13 +258,13 @@ class Order(NamedTuple):
         measurements: measurements.
         joints: joint that each input drives.
         signs: factor 1 or -1 of each input.
-        explained: share of each input that the equation of the chain leaves, ``(M,)``.
+        unexplained: unexplained share of each input in the equation of the chain, ``(M,)``.
     """
 
     measurements: list[Measurement]
     joints: Sequence[int]
     signs: np.ndarray
-    explained: np.ndarray
+    unexplained: np.ndarray
 
     def corrected(self, data: Averages) -> Averages:
         """Return averages with the inputs of the joints in turn, and their signs."""

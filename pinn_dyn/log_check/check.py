@@ -281,8 +281,8 @@ def _ask_inputs(
     if not servo:
         order = check_order([x.delayed(clear) for x in widths], source.u, source.q.units)
     of_training = [x.rows(x.stretch < training) for x in widths]
-    explained = None if order is None else order.explained
-    faults, curves, held = input_faults(of_training, curves, source.u, rigid, explained)
+    unexplained = None if order is None else order.unexplained
+    faults, curves, held = input_faults(of_training, curves, source.u, rigid, unexplained)
     states = {x.place for x in source.measurements if x.name == STATE and x.verdict == "stop"}
     pairs = zip(curves, source.u.columns, strict=False)
     curves = [x.without("the input is a state") if name in states else x for x, name in pairs]

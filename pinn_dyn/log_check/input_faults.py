@@ -62,17 +62,17 @@ def input_faults(
     curves: Sequence[DelayCurve],
     u: Columns,
     rigid: Regressor | None = None,
-    explained: np.ndarray | None = None,
+    unexplained: np.ndarray | None = None,
 ) -> tuple[list[Measurement], list[DelayCurve], list[int]]:
     """Look for faults of inputs that kernels of two widths agree on, see :func:`_faults`.
 
-    ``explained`` are shares of the inputs that an equation of all joints leaves, if there is one:
+    ``unexplained`` are the unexplained shares of the inputs in an equation of all joints, if any:
     an input that it explains has no fault.
     """
-    results, changed, held = _faults(widths[0], curves, u, rigid, explained)
+    results, changed, held = _faults(widths[0], curves, u, rigid, unexplained)
     if all(x.verdict == "ok" for x in results):
         return results, changed, held
-    again, _, _ = _faults(widths[1], curves, u, rigid, explained)
+    again, _, _ = _faults(widths[1], curves, u, rigid, unexplained)
     if [x.verdict for x in results] == [x.verdict for x in again]:
         return results, changed, held
     return [replace(x, verdict="ok", text="") for x in results], list(curves), [1] * len(curves)
@@ -83,7 +83,7 @@ def _faults(
     curves: Sequence[DelayCurve],
     u: Columns,
     rigid: Regressor | None,
-    explained: np.ndarray | None,
+    unexplained: np.ndarray | None,
 ) -> tuple[list[Measurement], list[DelayCurve], list[int]]:
     """Look for inputs whose clock drifts, whose drive saturates, or that are held for rows.
 
@@ -118,8 +118,8 @@ def _faults(
             times = trial.data.t[:, None]
             shift = drifts * trial.data.passed[:, None]
             constant = trial.shares(trial.data.input_at(i, times - [trial.delay, *_CONSTANT])).min()
-            if explained is not None:
-                constant = min(constant, explained[i])
+            if unexplained is not None:
+                constant = min(constant, unexplained[i])
             drifting = trial.data.input_at(i, times + shift)
             of_drifts = trial.shares(drifting) if len(drifts) else np.ones(1)
             best = min(_LESS * constant, _CLEAR)

@@ -51,7 +51,7 @@ def joints_of(columns, names=NAMES, **settings):
 
 
 def test_a_network_gets_the_sine_of_joints_that_turn():
-    """Without it, a network learns the load of a drive again in each revolution."""
+    """A network of the unwrapped angle learns the load of a drive again in each revolution."""
     t = torch.arange(400.0) / 100
     columns = {"t": t, "wheel": 4 * t, "hand": 3 * t.sin(), "slide": 9 * t, "u": 0 * t}
     q = dict(columns=["wheel", "hand", "slide"], unit=["rad", "rad", "m"])
