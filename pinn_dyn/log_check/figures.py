@@ -76,7 +76,7 @@ def residuals(motion: Motion, q: Columns, v: Columns | None, u: Columns) -> Figu
             ax.axhline(0, color="gray", linewidth=0.6)
             ax.set_xlabel(f"{names[key][k]} [{units[key][k]}]")
         grid[k, 0].set_ylabel(f"{label}: residual [{u.units[k]}]")
-    title = "Residual of each force; on the right with its dry friction; lines are means"
+    title = "Residual force over position, and over speed with dry friction; lines: means"
     figure.suptitle(title, fontsize="medium")
     return figure
 
