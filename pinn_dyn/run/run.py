@@ -27,7 +27,6 @@ from pinn_dyn.evaluation.prediction import model_for_rollouts, predict_with_memb
 from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.exports.exported_function import Real
 from pinn_dyn.exports.watch import Watch
-from pinn_dyn.identification.adaptation import Adaptation, Constant, adapted_constants
 from pinn_dyn.identification.payload import identify_payload
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
@@ -288,46 +287,6 @@ class Run:
             urdf=urdf,
             moment=moment,
         )
-
-    def adapt(
-        self,
-        frame: pd.DataFrame,
-        *,
-        time_constant: float = 60.0,
-        constants: Sequence[Constant] = ("friction",),
-    ) -> Adaptation:
-        """Follow friction and offsets of the drives over the time of a log, such as a warm-up.
-
-        All other constants are those of the run, see
-        :func:`~.evaluation.adaptation.adapted_constants`. The frame has the columns and units of
-        the log, and is cleaned by the same steps.
-
-        Args:
-            frame: the log.
-            time_constant: time in which friction may change by a half, s.
-            constants: constants to follow, ``"friction"`` and ``"offset"``.
-
-        Raises:
-            TypeError: if the model has no drives.
-            ValueError: without the columns of a log, or if the log is too short for the filter.
-        """
-        if not isinstance(self.model, KnownMechanics) or self.log is None:
-            kind = type(self.model).__name__
-            raise TypeError(f"a {kind} has no friction to follow: use a run of model=known on logs")
-        cutoff = self.config["optimizer"].get("cutoff", 6.0)
-        tables = []
-        for clean, motion in log_motions(self.log, frame):
-            table = adapted_constants(
-                self.model,
-                motion,
-                cutoff=cutoff,
-                time_constant=time_constant,
-                constants=constants,
-            )
-            table["time"] += clean.t[0] - float(motion.t[0])
-            table.insert(0, "run", clean.run)
-            tables.append(table)
-        return Adaptation(pd.concat(tables, ignore_index=True))
 
     @overload
     def predict(self, start: pd.DataFrame, *, threads: PositiveInt = 1) -> pd.DataFrame: ...

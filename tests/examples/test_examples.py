@@ -140,12 +140,6 @@ def test_saturated_drive(caplog):
     assert caplog.text.count("input 'tau' is a command that its drive cannot follow") == 1
 
 
-def test_warm_up(home):
-    """Friction falls to 62 % of 0.3 Nms/rad and 0.2 Nm."""
-    numbers = re.findall(r": \S+ -> (\S+) \(", run("warm_up.py"))
-    assert [float(x) for x in numbers[:2]] == pytest.approx([0.186, 0.124], abs=0.03)
-    assert (home / "warm_up.png").stat().st_size > 10_000
-
 
 @pytest.mark.slow
 @pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
