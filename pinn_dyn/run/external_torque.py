@@ -52,7 +52,7 @@ def external_torque(
     chain = None if link is None else _chain(model, urdf, link)
     motions: Sequence[Trajectory] = source.load().validation
     if quiet is not None:
-        motions = [motion for _, motion in log_motions(source, quiet)]
+        motions = [_motion(source, clean) for _, _, clean in source.recordings(quiet)]
     step = float(motions[0].t[1] - motions[0].t[0])
     sizes = [settled(observed_torques(model, x, bandwidth)[0], step, bandwidth) for x in motions]
     levels = contact_thresholds(sizes, step, bandwidth, false_alarms)
@@ -91,11 +91,6 @@ def external_torque(
     names = ["run", "start", "end", "joint", "torque"]
     found = pd.DataFrame(contacts, columns=names)
     return ExternalTorque(table, threshold, found, bandwidth, tuple(doubtful))
-
-
-def log_motions(source: LogSource, frame: pd.DataFrame) -> list[tuple[Recording, Trajectory]]:
-    """Return each run of a frame after the cleaning of a log."""
-    return [(clean, _motion(source, clean)) for _, _, clean in source.recordings(frame)]
 
 
 def _motion(source: LogSource, clean: Recording) -> Trajectory:

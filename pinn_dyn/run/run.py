@@ -39,7 +39,7 @@ from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
 from pinn_dyn.run.configuration.build import build_source
 from pinn_dyn.run.export import export, export_samples
-from pinn_dyn.run.external_torque import external_torque, log_motions
+from pinn_dyn.run.external_torque import external_torque
 from pinn_dyn.run.predict_frame import predict_frame
 
 TRAJECTORIES = "trajectories.pt"

@@ -118,7 +118,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(run, tmp_path):
 def test_a_finished_training_is_not_repeated(run, monkeypatch):
     finished = trained(run)
     monkeypatch.setattr(
-        "pinn_dyn.run.training.train.prepare", lambda *_: pytest.fail("trained again")
+        "pinn_dyn.run.training.prepared.build_data", lambda *_: pytest.fail("trained again")
     )
     assert trained(run).metrics == finished.metrics
     (run / "metrics.json").unlink()  # a copy

@@ -140,7 +140,6 @@ def test_saturated_drive(caplog):
     assert caplog.text.count("input 'tau' is a command that its drive cannot follow") == 1
 
 
-
 @pytest.mark.slow
 @pytest.mark.skipif(not find_compiler(), reason="the example needs a C compiler")
 def test_adaptive_tracking(home):

@@ -40,9 +40,8 @@ from pinn_dyn.models import KnownMechanics, LearnedConstants
 from pinn_dyn.plots import save
 from pinn_dyn.run.configuration.build import ConfigError, naming
 from pinn_dyn.run.configuration.defaults import defaults, section
-from pinn_dyn.run.run import Run
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD
-from pinn_dyn.run.training.prepared import PreparedTraining
+from pinn_dyn.run.training.prepared import PreparedTraining, TrainingPlan, prepare
 from pinn_dyn.training import COVARIANCE, FIT, Fit, LeastSquares
 from pinn_dyn.wording import did_you_mean
 
@@ -84,33 +83,24 @@ def check_trainer(settings: Mapping[str, Any]) -> None:
     log.warning("least squares does not use trainer.%s", ", trainer.".join(changed))
 
 
-def fit_constants(
-    prepare: Callable[..., PreparedTraining],
-    solver: LeastSquares,
-    saved: Mapping[str, Any],
-    start_from: Run | None,
-    callbacks: Sequence[Any] | None,
-    loggers: Sequence[Any] | None,
-) -> None:
+def fit_constants(plan: TrainingPlan, solver: LeastSquares, saved: Mapping[str, Any]) -> None:
     """Fit the constants of a model, and write the run.
 
     The constants are saved between the stages of the fit and on an interrupt. The next call
     continues from them.
 
     Args:
-        prepare: function that prepares model and data, called with ``batches=``.
+        plan: the training. ``start_from`` is an earlier fit, whose covariance becomes the prior. Of
+            the callbacks, only the figures of rollouts are used.
         solver: the least-squares solver.
         saved: content of the checkpoint of an interrupted fit; empty without one.
-        start_from: an earlier fit, whose covariance becomes the prior.
-        callbacks: callbacks of a training, of which only the figures of rollouts are used.
-        loggers: loggers of Lightning; None writes a TensorBoard log.
 
     Raises:
         ConfigError: if the parameters of the model are not physical constants, or the solver cannot
             use the data.
         KeyboardInterrupt: on an interrupt, from the SystemExit that ends the program.
     """
-    training = prepare(batches=1)
+    training = prepare(plan, saved, batches=1)
     model, windows = training.model, training.windows
     truth = stack_until(windows.splits.validation)
 
@@ -119,7 +109,7 @@ def fit_constants(
 
     try:
         with naming("optimizer"), _sigterm_exits():
-            result = _fitted(training, solver, truth, saved, start_from, keep)
+            result = _fitted(training, solver, truth, saved, keep)
     except (KeyboardInterrupt, SystemExit) as stop:
         raise KeyboardInterrupt from stop if isinstance(stop, SystemExit) else SystemExit(1)
     keep(result)
@@ -131,13 +121,13 @@ def fit_constants(
     record = training.record(1, metrics, stage=result.stage, left_out_errors=left_out)
     for name in ("best", "last"):
         _save(name, training, result, record)
-    _write_log(training, truth, metrics, callbacks, loggers)
+    _write_log(training, truth, metrics)
     runs = windows.splits.train
-    write_constants(model, result, windows.source, training.folder, runs, solver.cutoff)
+    write_constants(model, result, windows.source, training.plan.folder, runs, solver.cutoff)
     if isinstance(model, KnownMechanics) and isinstance(windows.source, LogSource):
         figure = residual_figure(windows.source, double_copy(model).structure)
         if figure is not None:
-            save(figure, training.folder / RESIDUALS)
+            save(figure, training.plan.folder / RESIDUALS)
     assert isinstance(model, LearnedConstants)
     training.finish(record, partial(weak_joints, model, runs, solver.cutoff, windows.source.labels))
 
@@ -165,7 +155,6 @@ def _fitted(
     solver: LeastSquares,
     truth: Trajectory,
     saved: Mapping[str, Any],
-    start_from: Run | None,
     keep: Callable[[Fit], None],
 ) -> Fit:
     """Fit the model, or continue the interrupted fit of a checkpoint."""
@@ -181,6 +170,7 @@ def _fitted(
         result = Fit.from_state(saved[FIT], sum(p.numel() for p in model.parameters()))
     if result is not None and result.stopped_in is None:
         return result
+    start_from = training.plan.start_from
     covariance = None if start_from is None else start_from.covariance
     if start_from is not None and covariance is None:
         raise ConfigError("start_from: the run has no covariance of its constants")
@@ -206,14 +196,14 @@ def _save(name: str, training: PreparedTraining, result: Fit, record: dict[str, 
     statistics = training.windows.statistics.to_dict()
     content = {
         "state_dict": {f"model.{key}": x for key, x in training.model.state_dict().items()},
-        "hyper_parameters": {"config": training.config, "statistics": statistics},
+        "hyper_parameters": {"config": training.plan.config, "statistics": statistics},
         "global_step": record["steps"],
         COVARIANCE: result.covariance,
         FIT: result.state(),
         RECORD: record,
         DATA: training.identity,
     }
-    path = training.folder / CHECKPOINTS / f"{name}.ckpt"
+    path = training.plan.folder / CHECKPOINTS / f"{name}.ckpt"
     path.parent.mkdir(exist_ok=True)
     save_whole(path, content)
 
@@ -221,13 +211,12 @@ def _save(name: str, training: PreparedTraining, result: Fit, record: dict[str, 
 def _write_log(
     training: PreparedTraining,
     truth: Trajectory,
-    metrics: Mapping[str, float],
-    callbacks: Sequence[Any] | None,
-    loggers: Sequence[Any] | None,
+    metrics: dict[str, float],
 ) -> None:
     """Log metrics, and to TensorBoard settings and the figures of rollouts."""
     from torch.utils.tensorboard import SummaryWriter  # takes half a second
 
+    callbacks, loggers = training.plan.callbacks, training.plan.loggers
     # Without callbacks, the module of the figures and Lightning are not imported.
     draws = [isinstance(x, evaluation.RolloutFigures) for x in callbacks or ()]
     figures = {}
@@ -238,7 +227,7 @@ def _write_log(
     writers = [getattr(logger, "experiment", None) for logger in loggers or ()]
     boards = [writer for writer in writers if isinstance(writer, SummaryWriter)]
     if loggers is None:
-        boards = [SummaryWriter(str(training.folder / "tensorboard"))]
+        boards = [SummaryWriter(str(training.plan.folder / "tensorboard"))]
         for name, value in metrics.items():
             boards[0].add_scalar(name, value, 0)
     for board in boards:

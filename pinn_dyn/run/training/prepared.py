@@ -6,11 +6,13 @@ import copy
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.atomic_files import write_whole
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
@@ -34,6 +36,11 @@ from pinn_dyn.run.run_folder import (
     require_same_data,
 )
 from pinn_dyn.run.training.known_data import check_known, warn_of_log
+from pinn_dyn.training import LeastSquares, WindowLoss
+
+if TYPE_CHECKING:
+    from lightning import Callback
+    from lightning.pytorch.loggers import Logger
 
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""
@@ -42,28 +49,61 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+class TrainingPlan:
+    """A training with all its parts, its run folder and what it reports.
+
+    Attributes:
+        source, model, loss, optimizer, scheduler, data, validator: as in :func:`~pinn_dyn.train`.
+        steps, validations: steps of the optimizer, and number of validations.
+        seed, compile, threads, trainer, callbacks, loggers: as in :func:`~pinn_dyn.train`.
+        start_from: a run whose weights or constants the training starts from.
+        folder: the run folder.
+        stores_data: true to store the trajectories in the folder.
+        config: description of the run, which its checkpoint keeps.
+    """
+
+    source: DataSource
+    model: ModelBuilder | Predictor
+    loss: Callable[..., WindowLoss]
+    optimizer: Callable[..., Optimizer] | LeastSquares
+    scheduler: Callable[..., LRScheduler]
+    data: Callable[..., DynamicsData]
+    validator: Callable[..., RolloutValidator]
+    steps: int
+    validations: int
+    seed: int
+    compile: bool | Literal["auto"]
+    threads: int
+    trainer: Mapping[str, Any]
+    callbacks: Sequence[Callback] | None
+    loggers: Sequence[Logger] | None
+    start_from: Run | None
+    folder: Path
+    stores_data: bool
+    config: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class PreparedTraining:
     """Model and data of a training in a run folder.
 
     Attributes:
+        plan: the training.
         model: the model, with the weights to start from.
         windows: training windows and validation trajectories.
         validator: errors of rollouts.
-        config: description of the run.
         identity: identity of the data.
         facts: name, seed, windows, software and hardware, for the record.
-        folder: the run folder.
         start, processor_start: times at which the training started, without interruptions, of the
             clock and of the processor, s.
     """
 
+    plan: TrainingPlan
     model: Predictor
     windows: DynamicsData
     validator: RolloutValidator
-    config: dict[str, Any]
     identity: dict[str, Any]
     facts: dict[str, Any]
-    folder: Path
     start: float
     processor_start: float
 
@@ -81,7 +121,7 @@ class PreparedTraining:
 
     def compared_settings(self) -> dict[str, Any]:
         """Return the settings that TensorBoard shows beside the validation error."""
-        flat = flattened(self.config)
+        flat = flattened(self.plan.config)
         settings = {key: value for key, value in flat.items() if key.startswith(_COMPARED)}
         return {key: x if isinstance(x, (int, float)) else str(x) for key, x in settings.items()}
 
@@ -90,11 +130,11 @@ class PreparedTraining:
 
         A warning names a model that predicts no better than constant velocity, with the reasons.
         """
-        record = finish(self.folder, record)
+        record = finish(self.plan.folder, record)
         log.info(
             "%s seed %d: validation error over %s %s, after %.0f s of training, in %s",
             *(record["name"], record["seed"], self.validator, score(record)),
-            *(record["training_seconds"], self.folder),
+            *(record["training_seconds"], self.plan.folder),
         )
         still = ConstantVelocity(self.model.num_coordinates, self.model.num_inputs)
         truth = stack_until(self.windows.splits.validation)
@@ -108,69 +148,52 @@ class PreparedTraining:
             )
 
 
-def prepare(
-    *,
-    source: DataSource,
-    model: ModelBuilder | Predictor,
-    saved: Mapping[str, Any],
-    start_from: Run | None,
-    data: Callable[..., DynamicsData],
-    validator: Callable[..., RolloutValidator],
-    batches: int,
-    config: dict[str, Any],
-    folder: Path,
-    stores: bool,
-) -> PreparedTraining:
+def prepare(plan: TrainingPlan, saved: Mapping[str, Any], batches: int) -> PreparedTraining:
     """Load the data, and build and check the model and its validation.
 
     Args:
-        source: the data.
-        model: the model, or its builder.
+        plan: the training.
         saved: content of the checkpoint that is resumed; empty for a new training.
-        start_from: a run whose weights a new training starts from.
-        data: builder of the windows.
-        validator: builder of the validation.
         batches: steps of an epoch.
-        config: description of the run.
-        folder: the run folder.
-        stores: true to store the trajectories in the folder.
     """
+    source, folder, config = plan.source, plan.folder, plan.config
     if saved:
         log.info("resuming in %s from step %d", folder, saved["global_step"])
     identity = same_data(source, folder, saved)
-    if stores:
+    if plan.stores_data:
         store(source, folder / TRAJECTORIES)
     if isinstance(source, LogSource):
         write_whole(folder / "log_report.md", source.report)
     torch.manual_seed(config["seed"])
-    windows = build_data(data, source, config["seed"], batches)
+    windows = build_data(plan.data, source, config["seed"], batches)
     with naming("data"):
         if warning := too_long_for(windows.splits.train, windows.step, source.labels):
             log.warning("%s: %s", source.name, warning)
         statistics = windows.statistics
     with naming("validator"):
-        rollouts = validator(training_step=statistics.step)
-        rollouts.check(stack_until(windows.splits.validation), windows.splits.train)
+        validator = plan.validator(training_step=statistics.step)
+        validator.check(stack_until(windows.splits.validation), windows.splits.train)
     with naming("model"):
-        predictor = model if isinstance(model, Predictor) else model(statistics=statistics)
-        _check_windows(predictor, windows)
-    known = predictor.known if isinstance(predictor, KnownAndNetwork) else predictor
+        built = plan.model
+        model = built if isinstance(built, Predictor) else built(statistics=statistics)
+        _check_windows(model, windows)
+    known = model.known if isinstance(model, KnownAndNetwork) else model
     if isinstance(known, KnownMechanics):
         check_known(known, source)
     warn_of_log(known, source)
-    if start_from is not None and not saved:
-        _take_weights(predictor, start_from)
+    if plan.start_from is not None and not saved:
+        _take_weights(model, plan.start_from)
     facts = {"name": config["name"], "seed": config["seed"], "pairs": len(windows.windows)}
+    record = saved.get(RECORD, {})
     return PreparedTraining(
-        model=predictor,
+        plan=plan,
+        model=model,
         windows=windows,
-        validator=rollouts,
-        config=config,
+        validator=validator,
         identity=identity,
         facts={**facts, **provenance()},
-        folder=folder,
-        start=time.perf_counter() - saved.get(RECORD, {}).get("training_seconds", 0.0),
-        processor_start=time.process_time() - saved.get(RECORD, {}).get("processor_seconds", 0.0),
+        start=time.perf_counter() - record.get("training_seconds", 0.0),
+        processor_start=time.process_time() - record.get("processor_seconds", 0.0),
     )
 
 

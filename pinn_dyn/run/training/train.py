@@ -47,7 +47,7 @@ from pinn_dyn.run.run_folder import (
 )
 from pinn_dyn.run.training.fit_constants import check_trainer, fit_constants
 from pinn_dyn.run.training.known_data import match_model
-from pinn_dyn.run.training.prepared import prepare, same_data
+from pinn_dyn.run.training.prepared import TrainingPlan, same_data
 from pinn_dyn.training import IncrementLoss, LeastSquares, MidpointLoss, WindowLoss, one_cycle
 from pinn_dyn.wording import did_you_mean
 
@@ -76,6 +76,8 @@ _COLUMNS = [
     "interpolation",
     "angles",
 ]
+
+_PARTS = ("data", "loss", "optimizer", "scheduler", "validator")
 
 log = logging.getLogger(__name__)
 
@@ -154,77 +156,66 @@ def train(
     if folder is None:
         temporary = TemporaryDirectory(prefix="pinn_dyn-")
         folder, callbacks = temporary.name, callbacks or ()
-    run_folder = Path(folder).expanduser()
-    on_log, least_squares = isinstance(source, LogSource), isinstance(optimizer, LeastSquares)
     model, model_name = _builder(model, model_name)
+    on_log, least_squares = isinstance(source, LogSource), isinstance(optimizer, LeastSquares)
     values = defaults(_factory(model).__name__, on_log=on_log, least_squares=least_squares)
     usual = section(values, "trainer")
     usual_steps, most_validations = usual.pop("steps"), usual.pop("validations")
     steps = steps or usual_steps
-    validations = validations or even_validations(steps, most_validations)
     if config is None:
         model, trainer = _with_defaults(model, on_log), {**usual, **trainer}
     if least_squares:
         check_trainer(trainer)
     elif _factory(model) in (KnownMechanics, KnownSystem):
         log.info("optimizer=least_squares (in Python LeastSquares()) fits constants in seconds")
-    data = data or partial(DynamicsData, **section(values, "data"), history=_history(model))
-    optimizer = optimizer or partial(AdamW, **section(values, "optimizer"))
-    losses = {"increment": partial(IncrementLoss, **section(values, "loss"))}
-    if loss is None or isinstance(loss, str):
-        loss = _by_name("loss", loss or "increment", {**losses, "midpoint": MidpointLoss})
     model, changes = match_model(model, source)
-    made_in_python = config is None
-    if config is None:
-        parts = dict(data=data, loss=loss, optimizer=optimizer, scheduler=scheduler)
-        settings = dict(seed=seed, compile=compile, threads=threads)
-        start = {} if start_from is None else {"start_from": str(start_from.folder)}
-        length = {"steps": steps, "validations": validations}
-        config = _description(source, model, model_name, parts | {"validator": validator})
-        config |= {**settings, **start, "trainer": {**length, **trainer}}
-    config = merged(with_structures(config), {"model": changes} if changes else {})
+    plan = TrainingPlan(
+        source=source,
+        model=model,
+        loss=_loss(loss, section(values, "loss")),
+        optimizer=optimizer or partial(AdamW, **section(values, "optimizer")),
+        scheduler=scheduler,
+        data=data or partial(DynamicsData, **section(values, "data"), history=_history(model)),
+        validator=validator,
+        steps=steps,
+        validations=validations or even_validations(steps, most_validations),
+        seed=seed,
+        compile=compile,
+        threads=threads,
+        trainer=trainer,
+        callbacks=callbacks,
+        loggers=loggers,
+        start_from=start_from,
+        folder=Path(folder).expanduser(),
+        stores_data=config is None and temporary is None,
+    )
+    description = with_structures(config or _description(plan, model_name))
+    plan = replace(plan, config=merged(description, {"model": changes} if changes else {}))
     try:
-        with _isolated(threads), claimed(run_folder, config, overwrite) as (checkpoint, saved):
-            prepare_now = partial(
-                prepare,
-                source=source,
-                model=model,
-                data=data,
-                validator=validator,
-                config=config,
-                folder=run_folder,
-                stores=made_in_python and temporary is None,
-                saved=saved,
-                start_from=start_from,
-            )
-            if saved.get(FINISHED):
-                same_data(source, run_folder, saved)
-                log.info("already trained: %s is loaded; overwrite=True trains again", run_folder)
-            elif isinstance(optimizer, LeastSquares):
-                fit_constants(prepare_now, optimizer, saved, start_from, callbacks, loggers)
-            else:
-                from pinn_dyn.run.training.trainer import train_network  # imports Lightning
-
-                train_network(
-                    prepare_now,
-                    folder=run_folder,
-                    checkpoint=checkpoint,
-                    seed=seed,
-                    length=(steps, validations),
-                    compile=compile,
-                    settings=trainer,
-                    parts=dict(loss=loss, optimizer=optimizer, scheduler=scheduler),
-                    callbacks=callbacks,
-                    loggers=loggers,
-                )
+        _carry_out(plan, overwrite)
     except KeyboardInterrupt:
-        way = _way_on(run_folder, temporary is not None, overwrite)
+        way = _way_on(plan.folder, temporary is not None, overwrite)
         # Without the frames of Lightning; the cause of the context is its exit, if any.
         raise KeyboardInterrupt(f"the training was interrupted: {way}") from None
     # The builder of a built model gives a model for the weights of the checkpoint.
     builder = (lambda statistics: copy.deepcopy(model)) if isinstance(model, Predictor) else model
-    run = load_run(run_folder, "best", trust=None, model=builder)
-    return replace(run, _made_in_python=source if made_in_python else None, _temporary=temporary)
+    run = load_run(plan.folder, "best", trust=None, model=builder)
+    return replace(run, _made_in_python=source if config is None else None, _temporary=temporary)
+
+
+def _carry_out(plan: TrainingPlan, overwrite: bool) -> None:
+    """Train, resume a training, or keep a finished one."""
+    folder = plan.folder
+    with _isolated(plan.threads), claimed(folder, plan.config, overwrite) as (checkpoint, saved):
+        if saved.get(FINISHED):
+            same_data(plan.source, folder, saved)
+            log.info("already trained: %s is loaded; overwrite=True trains again", folder)
+        elif isinstance(plan.optimizer, LeastSquares):
+            fit_constants(plan, plan.optimizer, saved)
+        else:
+            from pinn_dyn.run.training.trainer import train_network  # imports Lightning
+
+            train_network(plan, checkpoint, saved)
 
 
 @contextlib.contextmanager
@@ -258,6 +249,14 @@ def _factory(model: Any) -> Any:
     """Return the class or function of a builder, or the class of a built model."""
     factory = model.func if isinstance(model, partial) else model
     return factory if hasattr(factory, "__name__") else type(factory)
+
+
+def _loss(loss: str | Callable[..., WindowLoss] | None, values: Mapping[str, Any]) -> Any:
+    """Return the builder of a loss that may be a name."""
+    if loss is None or isinstance(loss, str):
+        names = {"increment": partial(IncrementLoss, **values), "midpoint": MidpointLoss}
+        return _by_name("loss", loss or "increment", names)
+    return loss
 
 
 def _by_name(kind: str, value: str, names: Mapping[str, Any]) -> Any:
@@ -299,10 +298,9 @@ def _model_description(model: Any) -> dict[str, Any]:
     }
 
 
-def _description(
-    source: DataSource, model: Any, name: str, parts: Mapping[str, Any]
-) -> dict[str, Any]:
+def _description(plan: TrainingPlan, name: str) -> dict[str, Any]:
     """Describe a training in Python; its trajectories are stored in the run folder."""
+    source = plan.source
     stored = {
         "_target_": "pinn_dyn.data.StoredSource",
         "path": TRAJECTORIES,
@@ -317,4 +315,10 @@ def _description(
         # Columns and cleaning, for predictions along a data frame.
         columns = {key: described(getattr(source, key)) for key in _COLUMNS}
         config["log"] = {"_target_": "pinn_dyn.data.LogSource", "files": "*", **columns}
-    return config | _model_description(model) | {key: described(x) for key, x in parts.items()}
+    config |= _model_description(plan.model)
+    config |= {name: described(getattr(plan, name)) for name in _PARTS}
+    config |= {name: getattr(plan, name) for name in ("seed", "compile", "threads")}
+    if plan.start_from is not None:
+        config["start_from"] = str(plan.start_from.folder)
+    length = {"steps": plan.steps, "validations": plan.validations}
+    return config | {"trainer": {**length, **plan.trainer}}

@@ -28,8 +28,8 @@ from pinn_dyn.models import Statistics
 from pinn_dyn.progress import Progress
 from pinn_dyn.run.configuration.build import ConfigError, naming
 from pinn_dyn.run.run_folder import CHECKPOINTS, DATA, RECORD, read_checkpoint
-from pinn_dyn.run.training.prepared import PreparedTraining
-from pinn_dyn.training import DynamicsLearner, WholeCheckpoints, WindowLoss
+from pinn_dyn.run.training.prepared import PreparedTraining, TrainingPlan, prepare
+from pinn_dyn.training import DynamicsLearner, LeastSquares, WholeCheckpoints, WindowLoss
 
 LONGEST_EPOCH = 1000
 """Largest number of steps between two writes of the last checkpoint."""
@@ -229,7 +229,7 @@ class Recorder(L.Callback):
         """Log settings and the error of the kept model for the tab HPARAMS of TensorBoard."""
         if not trainer.is_global_zero:
             return
-        kept = read_checkpoint(self.training.folder / CHECKPOINTS / "best.ckpt")[RECORD]
+        kept = read_checkpoint(self.training.plan.folder / CHECKPOINTS / "best.ckpt")[RECORD]
         error = validation_error(kept["validation"])
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
@@ -238,55 +238,37 @@ class Recorder(L.Callback):
 
 
 @isolate_rng()
-def train_network(
-    prepare: Callable[..., PreparedTraining],
-    *,
-    folder: Path,
-    checkpoint: Path | None,
-    seed: int,
-    length: tuple[int, int],
-    compile: bool | Literal["auto"],
-    settings: Mapping[str, Any],
-    parts: Mapping[str, Any],
-    callbacks: Sequence[L.Callback] | None,
-    loggers: Sequence[Logger] | None,
-) -> None:
+def train_network(plan: TrainingPlan, checkpoint: Path | None, saved: Mapping[str, Any]) -> None:
     """Train a model from its start or a checkpoint, and write the run.
 
     Args:
-        prepare: function that prepares model and data, called with ``batches=``.
-        folder: the run folder.
+        plan: the training.
         checkpoint: the checkpoint of an interrupted training, if any.
-        seed: seed of all random generators.
-        length: steps and validations.
-        compile: true to compile the dynamics.
-        settings: arguments of :class:`lightning.Trainer`.
-        parts: builders of loss, optimizer and schedule.
-        callbacks, loggers: as in :func:`~pinn_dyn.train`.
+        saved: its content.
     """
     # A missing compiler or device is refused before data are simulated.
-    compiled = compiles(compile, length[0], settings)
-    if callbacks is None:
-        callbacks = [RolloutFigures()]
-    if loggers is None:
-        loggers = [tensorboard(folder)]
-    count = epochs(*length)
-    trainer = build_trainer(folder, settings, callbacks, loggers, count)
-    L.seed_everything(seed, verbose=False)
-    training = prepare(batches=count[1])
+    compiled = compiles(plan.compile, plan.steps, plan.trainer)
+    callbacks = [RolloutFigures()] if plan.callbacks is None else plan.callbacks
+    loggers = [tensorboard(plan.folder)] if plan.loggers is None else plan.loggers
+    length = epochs(plan.steps, plan.validations)
+    trainer = build_trainer(plan.folder, plan.trainer, callbacks, loggers, length)
+    L.seed_everything(plan.seed, verbose=False)
+    training = prepare(plan, saved, batches=length[1])
     model, windows = training.model, training.windows
     if windows.batch_size % trainer.world_size:
         text = f"batch_size {windows.batch_size} is no multiple of {trainer.world_size} devices"
         raise ConfigError(f"data: {text}")
-    clipping = {key: settings[key] for key in CLIPPING if key in settings}
+    assert not isinstance(plan.optimizer, LeastSquares)
     learner = build_learner(
         model,
         windows.statistics,
         training.validator,
-        **parts,
-        config=training.config,
+        loss=plan.loss,
+        optimizer=plan.optimizer,
+        scheduler=plan.scheduler,
+        config=plan.config,
         compile=compiled,
-        clipping=clipping,
+        clipping={key: plan.trainer[key] for key in CLIPPING if key in plan.trainer},
     )
     trainer.callbacks.insert(0, Recorder(training))  # type: ignore[attr-defined]
     data = LightningData(windows)
@@ -297,5 +279,5 @@ def train_network(
     except SystemExit as stop:  # Lightning's end of an interrupted training
         raise KeyboardInterrupt from stop
     # Other processes have counted the steps of theirs.
-    done = read_checkpoint(folder / CHECKPOINTS / "last.ckpt")["global_step"]
+    done = read_checkpoint(plan.folder / CHECKPOINTS / "last.ckpt")["global_step"]
     training.finish(training.record(done, trainer.callback_metrics))
