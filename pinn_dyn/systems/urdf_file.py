@@ -56,6 +56,8 @@ class UrdfFile:
         self.joints = self._by_name("joint", mistakes)
         self.ends = {name: _ends(joint) for name, joint in self.joints.items()}
         linked = set[str]().union(*self.ends.values())
+        if "world" in linked:  # of Drake, which need not be defined
+            self.links.setdefault("world", ET.Element("link", name="world"))
         if undefined := linked - self.links.keys():
             mistakes.append(f"joints name the links {sorted(undefined)}, which are not defined")
         children = Counter(child for _, child in self.ends.values())

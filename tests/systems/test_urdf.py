@@ -32,6 +32,7 @@ def joint(name, parent, child):
         ("<link", '<x:arg name="n" xmlns:x="http://wiki.ros.org/xacro"/><link'),
         ("<link", '<xacro:property name="m" value="${n}"/><drake:joint drake:k="1"/><link'),
         ('<link name="base"/>', f'<link name="base">{INERTIAL}</inertial></link>'),  # does not move
+        ('<link name="base"/>', f'<link name="base"/>{joint("weld", "world", "base")}'),  # Drake's
     ],
 )
 def test_an_odd_urdf_may_be_right(old, new):
