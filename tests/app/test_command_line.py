@@ -61,7 +61,7 @@ def test_paths_of_run_folders_need_no_key(elsewhere):
 
 def test_a_data_set_without_a_name_has_that_of_its_file(elsewhere):
     (elsewhere / "conf" / "dataset").mkdir(parents=True)
-    log = "files: a.csv\nq: {columns: q, unit: rad}\nu: []\nvalidation: null\ntest: null\n"
+    log = "files: a.csv\nq: {columns: q, unit: rad}\nu: []\n"
     text = f"defaults: [csv_log, _self_]\n{log}"
     (elsewhere / "conf" / "dataset" / "my_arm.yaml").write_text(text)
     config = composed("train", ["dataset=my_arm"], str(elsewhere / "conf"))

@@ -12,8 +12,6 @@ from tests.support.recorded_logs import LOGS, ROOT, needs_logs
 LOG = {
     "defaults": ["csv_log", "_self_"],
     "files": "*.csv",
-    "validation": None,
-    "test": None,
 }
 
 

@@ -301,6 +301,15 @@ def test_whole_runs_of_unequal_length_are_one_roll_out_each(tmp_path):
     assert "2 trajectories of 2.5 to 3 s" in log.report
 
 
+def test_pieces_are_as_long_as_the_median_run_but_at_most_5_s(tmp_path):
+    for k, seconds in enumerate((4.0, 12.0, 2.0, 3.0, 6.0)):
+        write(tmp_path, motion(seconds, phase=0.3 * k), f"run_{k}.csv")
+    parts = dict(validation={"runs": ["run_2", "run_3"]}, test={"runs": ["run_1"]})
+    splits = source(tmp_path, **parts).load()
+    assert [item.duration for item in splits.validation] == pytest.approx([2.5])
+    assert [item.duration for item in splits.test] == pytest.approx([5.0, 5.0])
+
+
 def test_pieces_know_the_motion_before_them(folder):
     """Models of a delay or with a memory look back. The first piece of a stretch has no past."""
     first, second = source(folder, u=dict(columns=["u1", "u2"], unit="Nm")).load().test

@@ -56,6 +56,7 @@ def pieces_of(
     if part.piece == "whole":
         pieces = list(stretches)
         return pieces, f"{summary(pieces, step)}, each one rollout"
+    assert part.piece is not None, "chosen by fitting()"
     span = round(part.piece / step)
     if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
         raise LogError(

@@ -28,13 +28,14 @@ class Part:
     """Validation or test data: whole runs, or the ends of runs.
 
     Args:
-        piece: length of the rollouts, s; ``"whole"`` if each stretch is a rollout.
+        piece: length of the rollouts, s; ``"whole"`` if each stretch is a rollout; None for 5 s, or
+            the median stretch if it is shorter.
         runs: number of runs, drawn by the seed, or the names of the runs.
         seconds: duration at the end of each run that is not assigned as a whole, s. Exactly one of
             ``runs`` and ``seconds`` is required.
     """
 
-    piece: PositiveFloat | Literal["whole"]
+    piece: PositiveFloat | Literal["whole"] | None = None
     runs: PositiveInt | Sequence[str | int] | None = None
     seconds: PositiveFloat | None = None
 
@@ -66,8 +67,7 @@ def default_split(
     whole_runs = len(runs) >= _WHOLE_RUNS
     median, shortest = float(np.median([*lengths.values()])), min(lengths.values())
     longest = min(_PIECE, (median if whole_runs else _SHARE * shortest) - lost)
-    # The piece is a multiple of the sample time.
-    piece = round(max(int(longest / step + 1e-6), 1) * step, 9)
+    piece = max(_whole_steps(longest, step), round(step, 9))
     if whole_runs:
         long = [name for name, length in lengths.items() if length >= median - 0.5 * step]
         count = max(round(_SHARE * len(runs)), 1)
@@ -79,20 +79,29 @@ def default_split(
 
 
 def fitting(part: Part, stretches: Sequence[Recording], lead: float, report: Report) -> Part:
-    """Shorten the pieces of a part if its runs are too short after losing ``lead`` s.
+    """Choose the length of the pieces if it is None, or shorten it if the runs are too short.
 
     A shift of the inputs drops ``lead`` s at the beginning of each run.
     """
-    longest = max(stretches, key=lambda item: item.duration)
-    if not lead or part.piece == "whole" or longest.duration - lead >= part.piece:
+    if part.piece == "whole":
         return part
-    step = float(np.median(np.diff(longest.t)))
-    piece = round(int((longest.duration - lead) / step + 1e-6) * step, 9)
-    if longest.duration < part.piece - 0.5 * step or piece <= 0:
+    durations = [item.duration for item in stretches]
+    step = float(np.median(np.diff(stretches[0].t)))
+    usual = min(float(np.median(durations)) - lead, _PIECE)
+    if part.piece is None:
+        return replace(part, piece=_whole_steps(usual, step))
+    longest = max(durations)
+    piece = _whole_steps(longest - lead, step)
+    if not lead or longest - lead >= part.piece or longest < part.piece - 0.5 * step or piece <= 0:
         return part
     text = f"pieces of {piece:g} s instead of {part.piece:g} s, as the input delay drops {lead:g} s"
-    report.add("Splits", longest.place, text)
+    report.add("Splits", stretches[durations.index(longest)].place, text)
     return replace(part, piece=piece)
+
+
+def _whole_steps(duration: float, step: float) -> float:
+    """Return the largest multiple of the sample time up to a duration, s."""
+    return round(int(duration / step + 1e-6) * step, 9)
 
 
 def split(
