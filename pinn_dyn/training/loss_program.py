@@ -14,7 +14,7 @@ from torch.func import functional_call
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, State
-from pinn_dyn.mechanics.compilation import Unrolled, compile_graph, integrated_by
+from pinn_dyn.mechanics.compilation import compile_graph
 from pinn_dyn.training.losses import WindowLoss
 from pinn_dyn.training.parameter_vector import MOVED, CompiledAdamW, ParameterVector
 
@@ -145,8 +145,7 @@ class _Loss(nn.Module):
         self.loss = loss
 
     def forward(self, windows: Windows) -> Tensor:
-        with integrated_by(self.model, Unrolled(self.model.integrator)):
-            return self.loss(self.model, windows)
+        return self.loss(self.model, windows)
 
 
 def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:
