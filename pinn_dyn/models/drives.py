@@ -58,14 +58,6 @@ class Drives(HasConstants, InputMatrix):
     def largest_force(self) -> Tensor:
         """Return the largest force of each drive at rest, ``(n,)``."""
 
-    def springs(self) -> Tensor:
-        """Return the stiffness that the drives add to the joints, ``(N,)``."""
-        return torch.zeros_like(self.selection[0])
-
-    def damping_rates(self) -> Tensor:
-        """Return the damping that the drives add to the joints, ``(N,)``."""
-        return torch.zeros_like(self.selection[0])
-
     def largest_input(self) -> Tensor | None:
         """Return the input of the largest force at rest, ``(n,)``, or None without limits."""
         return None
@@ -100,18 +92,15 @@ class TorqueDrives(Drives):
         joints: Sequence[NonNegativeInt] | None = None,
     ):
         super().__init__(scales, joints)
-        motors = tuple(scales.joints[k] for k in self.joints)
+        motors = scales.restricted(self.joints)
         self._force = scales.value
-        start = torch.as_tensor(gain, dtype=torch.float64).expand(len(motors))
+        start = torch.as_tensor(gain, dtype=torch.float64).expand(len(self.joints))
         if gain_spread > 0:
-            units = [f"{joint.force}/u" for joint in motors]
-            named = replace(scales, named=motors)
-            self.gain = named.positive("drive gain", 1.0, start, gain_spread, units)
+            self.gain = motors.positive("drive gain", 1.0, start, gain_spread, "gain")
         self.register_buffer("initial_strength", start.clone())
         self.limits: DriveLimits | None = None
         if limits is not None:
-            force = scales.value[self.joints]
-            self.limits = limits(replace(scales, named=motors, value=force))
+            self.limits = limits(replace(motors, value=scales.value[self.joints]))
             self.affine, self.limited = False, True
             # A fit of filtered forces with learned limits would find zero limits and zero bodies.
             self.identified_by_forces = not self.limits.learned

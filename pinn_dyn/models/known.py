@@ -137,7 +137,7 @@ class KnownMechanics(LearnedConstants):
         self.input_affine = self.drives.affine and not self.friction.by_load
         self.sticking = self.friction.sticking
         self.integrator = with_friction(integrator, self.sticking)
-        self.elastic = Springs(structure) if isinstance(structure, ElasticJoints) else None
+        self.elastic = structure.springs() if isinstance(structure, ElasticJoints) else None
         self._set_buffers(offsets, force)
         self.float()
 
@@ -148,18 +148,16 @@ class KnownMechanics(LearnedConstants):
         joints, force = scales.joints, scales.value.double()
         inertia = force / statistics.acceleration.double()
         damping = force / statistics.v_std.double()
-        motors = replace(scales, named=tuple(joints[k] for k in self.driven))
-        units = [joint.inertia for joint in motors.joints]
-        self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, units)
-        units = [joint.damping for joint in joints]
-        self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, units)
+        motors = scales.restricted(self.driven)
+        self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, "inertia")
+        self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, "damping")
         names = self.structure.joint_names
         offsets = [k for k in self.driven if names[k] not in springs]
         kinds = ["torque" if joints[k].turns else "force" for k in offsets]
         self.offset = RealConstants(
             0.3 * force[offsets],
             [f"{kind} offset of {names[k]}" for kind, k in zip(kinds, offsets, strict=True)],
-            [joints[k].force for k in offsets],
+            [joints[k].unit("force") for k in offsets],
         )
         index = [names.index(name) for name in springs]
         self.springs = JointSprings(scales, index) if springs else None
@@ -167,10 +165,8 @@ class KnownMechanics(LearnedConstants):
 
     def _set_buffers(self, offsets: list[int], force: Tensor) -> None:
         unit = torch.eye(self.num_coordinates)
-        self.register_buffer("motors", unit[self.driven], persistent=False)
         self.register_buffer("offset_joints", unit[offsets], persistent=False)
         self.register_buffer("typical_force", force, persistent=False)
-        self.motors: Tensor
         self.offset_joints: Tensor
         self.typical_force: Tensor
 
@@ -194,7 +190,8 @@ class KnownMechanics(LearnedConstants):
 
     def drive_gain(self) -> Tensor:
         """Return k, ``(N,)``; 1 for passive joints."""
-        return self.input_gain() @ self.motors + (1 - self.motors.sum(0))
+        driven = self.drives.selection
+        return self.input_gain() @ driven + (1 - driven.sum(0))
 
     def input_gain(self) -> Tensor:
         """Return k of the driven joints, or the strength of other drives, ``(M,)``."""
@@ -207,7 +204,11 @@ class KnownMechanics(LearnedConstants):
 
     def rotor_inertia(self) -> Tensor:
         """Return r, ``(N,)``; 0 for passive joints."""
-        return self.armature() @ self.motors
+        return self.armature() @ self.drives.selection
+
+    def all_springs(self) -> list[Springs]:
+        """Return the springs of joints, and those of elastic joints."""
+        return [part for part in (self.springs, self.elastic) if part is not None]
 
     def physical_constants(self) -> list[Named]:
         """Return bodies, drives, friction and gains in SI units."""
@@ -219,7 +220,7 @@ class KnownMechanics(LearnedConstants):
             constants.append(Named(names, [unit] * len(names), values, lower))
         drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
         if self.elastic is not None:
-            drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
+            drives += self.elastic.physical_constants()
         drives += self.friction.physical_constants()
         drives += self.drives.physical_constants()
         if self.springs is not None:
@@ -257,16 +258,14 @@ class KnownMechanics(LearnedConstants):
     def drive_force(
         self, q: Tensor, v: Tensor, a: Tensor, u: Tensor, share: Tensor | None = None
     ) -> Tensor:
-        """Return r a + D v + F + k_s q - o - motor force, ``(*batch, N)``.
+        """Return r a + D v + F - o - motor force, ``(*batch, N)``.
 
         Without ``share``, F is the smooth law. With the share of forward motion, F is the sliding
-        friction. The terms Y pi and the forces of elastic joints are not included.
+        friction. The terms Y pi and the forces of springs are not included.
         """
         friction = self.friction(v) if share is None else self.friction.sliding(v, share)
         resistance = self.rotor_inertia() * a + self.viscous() * v + friction
-        if self.springs is not None:
-            resistance = resistance + self.springs.springs() * q
-        return resistance - self.constant_force() - self.motor_force(q, v, u)
+        return resistance - self.offset() @ self.offset_joints - self.motor_force(q, v, u)
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
         """Return the ratio of fitted to initial forces per input, and its largest likely value.
@@ -297,9 +296,10 @@ class KnownMechanics(LearnedConstants):
         return energy + ((0.5 * self.spring_force(q) - self.constant_force()) * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        matrix = torch.diag(self.viscous()) + self.drives.damping_matrix()
-        if self.elastic is not None:
-            matrix = matrix + self.elastic.matrices()[1]
+        rates, drives = self.viscous(), self.drives.damping_rates()
+        matrix = torch.diag(rates if drives is None else rates + drives)
+        for springs in self.all_springs():
+            matrix = matrix + springs.matrices()[1]
         return matrix.expand(*q.shape, -1)
 
     def input_matrix(self, q: Tensor) -> Tensor:
@@ -322,12 +322,9 @@ class KnownMechanics(LearnedConstants):
         return tau.clamp(smallest, largest)
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        drives = self.drives.stiffness_matrix()
-        matrices = [] if drives is None else [drives]
-        if self.springs is not None:
-            matrices.append(torch.diag(self.springs.springs()))
-        if self.elastic is not None:
-            matrices.append(self.elastic.matrices()[0])
+        drives = self.drives.springs()
+        matrices = [] if drives is None else [torch.diag(drives)]
+        matrices += [springs.matrices()[0] for springs in self.all_springs()]
         return torch.stack(matrices).sum(0) if matrices else None
 
     def spring_force(self, q: Tensor) -> Tensor:

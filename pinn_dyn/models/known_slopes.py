@@ -34,8 +34,8 @@ class KnownSlopes(Slopes):
     def by_regressor(self, regressor: Tensor, *at: Tensor) -> Tensor:
         def elements(m: Any) -> Tensor:
             """Return the forces of all drives, followed by all springs, ``(*batch, N + S)``."""
-            force = m.drive_force(*at)
-            return force if m.elastic is None else torch.cat([force, m.elastic.forces(*at[:2])], -1)
+            springs = (part.forces(*at[:2]) for part in m.all_springs())
+            return torch.cat([m.drive_force(*at), *springs], dim=-1)
 
         drives = self._drive_slopes(elements, at[0])
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
@@ -48,8 +48,8 @@ class KnownSlopes(Slopes):
             force = self.model.drive_force(*state, a, *inputs).sum()
             drives = torch.autograd.grad(force, state, materialize_grads=True)
         by_q, by_v = (x + torch.diag_embed(y) for x, y in zip((by_q, by_v), drives, strict=True))
-        if self.model.elastic is not None:
-            stiffness, damping = self.model.elastic.matrices()
+        for springs in self.model.all_springs():
+            stiffness, damping = springs.matrices()
             by_q, by_v = by_q + stiffness, by_v + damping
         return torch.cat([by_q, by_v], dim=-1)
 
@@ -83,12 +83,11 @@ class KnownSlopes(Slopes):
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
         # Constants of drives have an entry per driven joint, not per joint.
-        sides = dict.fromkeys(("armature", "drives"), self.model.motors)
+        sides = dict.fromkeys(("armature", "drives"), self.model.drives.selection)
         sides["offset"] = self.model.offset_joints
-        if self.model.springs is not None:
-            sides["springs"] = self.model.springs.selection
-        if self.model.elastic is not None:
-            sides["elastic"] = self.model.elastic.stretch
+        for name in ("springs", "elastic"):
+            if (springs := getattr(self.model, name)) is not None:
+                sides[name] = springs.stretch
         blocks = []
         for name, slope in zip(values, slopes, strict=True):
             side = sides.get(name.split(".")[1])
@@ -108,8 +107,8 @@ class KnownSamples(Samples):
     def missing_force(self) -> Tensor:
         bodies = self._regressor @ self.model.body_parameters().flatten()
         force = bodies + self.model.drive_force(*self.at)
-        if self.model.elastic is not None:
-            force = force + self.model.elastic.forces(*self.at[:2]) @ self.model.elastic.stretch
+        for springs in self.model.all_springs():
+            force = force + springs.forces(*self.at[:2]) @ springs.stretch
         return force
 
     def by_parameters(self) -> Tensor:

@@ -95,10 +95,6 @@ class KnownSystem(LearnedConstants):
     input_force = _of_structure("input_force")
     _residual_force = _of_structure("_residual_force")
     applied_force = _of_structure("applied_force")
-    _hamiltonian_gradient = _of_structure("_hamiltonian_gradient")
-    _momentum = _of_structure("_momentum")
-    _velocity = _of_structure("_velocity")
-    _kinetic_gradient = _of_structure("_kinetic_gradient")
 
 
 def _units_of(structure: MechanicalSystem) -> dict[str, list[str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, MechanicalSystem, State
@@ -77,16 +78,20 @@ class StructuredNetwork(MechanicalSystem):
         return Scales(statistics, value, self.angles)
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        return self.potential(q) + self.input.spring_energy(q)
+        springs, energy = self.input.springs(), self.potential(q)
+        return energy if springs is None else energy + 0.5 * (springs * q * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        return self.damping.matrix(q) + self.input.damping_matrix()
+        rates, matrix = self.input.damping_rates(), self.damping.matrix(q)
+        return matrix if rates is None else matrix + torch.diag(rates)
 
     def damping_force(self, q: Tensor, v: Tensor) -> Tensor:
-        return self.damping.product(q, v) + self.input.damping_force(v)
+        rates, force = self.input.damping_rates(), self.damping.product(q, v)
+        return force if rates is None else force + rates * v
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        return self.input.stiffness_matrix()
+        springs = self.input.springs()
+        return None if springs is None else torch.diag(springs)
 
     def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         force = self.input.applied(q, v, u)
@@ -117,4 +122,5 @@ class StructuredNetwork(MechanicalSystem):
         return v.new_zeros(()) if self.residual is None else self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:
-        return self.potential.gradient(q) + self.input.spring_force(q)
+        springs, force = self.input.springs(), self.potential.gradient(q)
+        return force if springs is None else force + springs * q

@@ -89,18 +89,17 @@ class _Batch:
     def move(self, state: dict[str, Any], group: dict[str, Any]) -> None:
         """Take a step with the gradients of the parameters."""
         beta1, beta2 = group["betas"]
-        gradient, first = self._gradient, not state
+        gradient = self._gradient
         torch._foreach_copy_(self._gradients, [_matrix(p.grad) for p in self.parameters])
         sides = [(gradient, gradient.mT), (gradient.mT, gradient)] if self._turns else []
-        if first:
+        if not state:
             state["step"] = 0
             state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(gradient) for _ in range(2))
-            state["averages"] = [torch.zeros_like(left @ right) for left, right in sides]
-        for average, factors in zip(state["averages"], sides, strict=True):
-            average.baddbmm_(*factors, beta=beta2, alpha=1 - beta2)
-        if first:
+            state["averages"] = [(1 - beta2) * (left @ right) for left, right in sides]
             state["bases"] = self._eigenvectors(state["averages"])
             return
+        for average, factors in zip(state["averages"], sides, strict=True):
+            average.baddbmm_(*factors, beta=beta2, alpha=1 - beta2)
         state["step"] += 1
         step, mean, square, bases = (state[x] for x in ("step", "exp_avg", "exp_avg_sq", "bases"))
         turned = _turned(gradient, bases)
