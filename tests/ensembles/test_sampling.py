@@ -114,7 +114,7 @@ def test_the_spread_is_that_of_the_posterior_where_no_body_is_near_its_limit():
 def test_parameters_of_bodies_are_the_inverse_of_the_bodies():
     bodies = known_model().bodies
     z = torch.randn(5, *bodies.z.shape, generator=torch.Generator().manual_seed(0)).double()
-    inertia = bodies.inertia_of(z)
+    inertia = bodies.value_of(z)
     torch.testing.assert_close(bodies.parameters_of(inertia), z)
 
 
