@@ -10,7 +10,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.ensembles.ensemble import Ensemble
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.models.known_constants import Constants, PositiveDefinite
+from pinn_dyn.models.known_constants import Constants
 
 _STEPS_PER_DIMENSION = 10
 _MARGIN = 0.999  # of the way to the border of what is possible
@@ -71,7 +71,7 @@ class _Limits:
     def __init__(self, model: nn.Module, size: int):
         self.factor = torch.zeros(size, dtype=torch.float64)
         self.log_factor = self.factor.clone()
-        self.parts: list[tuple[PositiveDefinite, slice, Tensor, Tensor]] = []
+        self.parts: list[tuple[Constants, slice, Tensor, Tensor]] = []
         positions, first = {}, 0
         for parameter in model.parameters():
             positions[id(parameter)] = slice(first, first + parameter.numel())
@@ -80,30 +80,31 @@ class _Limits:
             if not isinstance(part, Constants):
                 continue
             where = positions[id(part.z)]
-            if not isinstance(part, PositiveDefinite):
+            if not part.positive:
                 self.factor[where] = torch.as_tensor(part.scale_with_force).double()
                 continue
-            matrices = part.matrices()
+            values = part()
             slopes = torch.func.jacrev(part.value_of)(part.z).reshape(-1, part.z.numel())
-            self.parts.append((part, where, matrices, slopes))
-            one = torch.ones((), dtype=torch.float64)
-            of_factor = lambda s, part=part, x=matrices: part.parameters_of(s * x)  # noqa: E731
-            rise = torch.func.jvp(of_factor, (one,), (one,))[1].flatten()
+            self.parts.append((part, where, values, slopes))
+            rise = torch.func.jvp(part.parameters_of, (values,), (values,))[1].flatten()
             self.log_factor[where] = rise * part.scale_with_force
 
     def changes(self, shift: Tensor) -> list[Tensor]:
-        """Return the change of the matrices of each part, ``(*batch, n, k, k)``."""
+        """Return the change of the constants of each part, ``(*batch, n)`` or with matrices."""
         return [
-            (shift[..., where] @ slopes.T).unflatten(-1, matrices.shape)
-            for _, where, matrices, slopes in self.parts
+            (shift[..., where] @ slopes.T).unflatten(-1, values.shape)
+            for _, where, values, slopes in self.parts
         ]
 
     def reach(self, shift: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Return the least and the largest s for which shift + s direction is possible."""
         factors = []  # all factors 1 + s x of eigenvalues stay positive
         changes = zip(self.parts, self.changes(shift), self.changes(direction), strict=True)
-        for (_, _, matrices, _), moved, change in changes:
-            root = torch.linalg.cholesky(matrices + moved)
+        for (part, _, values, _), moved, change in changes:
+            if values.ndim == 1:
+                factors.append(change / (values + moved - part.lower))
+                continue
+            root = torch.linalg.cholesky(values + moved)
             half = torch.linalg.solve_triangular(root, change, upper=False)
             whitened = torch.linalg.solve_triangular(root, half.mT, upper=False)
             factors.append(torch.linalg.eigvalsh(whitened).flatten(1))
@@ -113,10 +114,10 @@ class _Limits:
 
     def parameters_of(self, z: Tensor, shift: Tensor) -> Tensor:
         """Return z of shifted bodies and constants, ``(*batch, P)``."""
-        values = z + shift
-        for (part, where, matrices, _), moved in zip(self.parts, self.changes(shift), strict=True):
-            values[:, where] = part.parameters_of(matrices + moved).flatten(1)
-        return values
+        parameters = z + shift
+        for (part, where, values, _), moved in zip(self.parts, self.changes(shift), strict=True):
+            parameters[:, where] = part.parameters_of(values + moved).flatten(1)
+        return parameters
 
 
 def _possible(limits: _Limits, root: Tensor, count: int, generator: torch.Generator) -> Tensor:

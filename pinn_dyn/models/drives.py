@@ -24,7 +24,6 @@ class Drives(HasConstants, InputMatrix):
         gain: learned drive gains, or None.
         identified_by_forces: true if filtering the input has the same effect as filtering the
             force, which allows a fit of filtered forces.
-        limited: true if some commands exceed the largest force.
         takes_targets: true if the inputs are target positions instead of forces.
         initial_strength: :meth:`strength` at the start, ``(n,)``.
 
@@ -35,7 +34,6 @@ class Drives(HasConstants, InputMatrix):
 
     gain: Constants | None
     identified_by_forces: bool = True
-    limited: bool = False
     takes_targets: bool = False
     selection: Tensor
     initial_strength: Tensor
@@ -101,7 +99,7 @@ class TorqueDrives(Drives):
         self.limits: DriveLimits | None = None
         if limits is not None:
             self.limits = limits(replace(motors, value=scales.value[self.joints]))
-            self.affine, self.limited = False, True
+            self.affine = False
             # A fit of filtered forces with learned limits would find zero limits and zero bodies.
             self.identified_by_forces = not self.limits.learned
 

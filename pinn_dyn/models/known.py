@@ -191,11 +191,7 @@ class KnownMechanics(LearnedConstants):
     def drive_gain(self) -> Tensor:
         """Return k, ``(N,)``; 1 for passive joints."""
         driven = self.drives.selection
-        return self.input_gain() @ driven + (1 - driven.sum(0))
-
-    def input_gain(self) -> Tensor:
-        """Return k of the driven joints, or the strength of other drives, ``(M,)``."""
-        return self.drives.strength()
+        return self.drives.strength() @ driven + (1 - driven.sum(0))
 
     def constant_force(self) -> Tensor:
         """Return o, or k_s q_0 of joints with a spring, ``(N,)``; 0 for other passive joints."""
@@ -277,7 +273,7 @@ class KnownMechanics(LearnedConstants):
         initial = self.structure.rigid_force(q, v, a, self.bodies.start(), gravity=True)
         ratio = (fitted + self.rotor_inertia() * a).norm(dim=0) / initial.norm(dim=0)
         ratio = torch.where(initial.norm(dim=0) > 0, ratio, 1.0)  # a motor has no body
-        gain_ratio = self.input_gain() / self.drives.initial_strength
+        gain_ratio = self.drives.strength() / self.drives.initial_strength
         return ratio[self.driven] / gain_ratio, self._largest_ratio
 
     def slopes(self) -> KnownSlopes:

@@ -31,12 +31,14 @@ class Constants(nn.Module, abc.ABC):
     In a least-squares fit, z has a standard normal prior.
 
     Attributes:
+        positive: true for numbers above ``lower``, and for positive definite matrices.
         names, units: meaning and unit of each entry of the flattened z.
         lower: lower limit of the constants.
         scale_with_force: true if a common factor of all masses and forces multiplies the constants,
             one value or one per entry of the flattened z.
     """
 
+    positive: bool = False
     lower: float = -math.inf
     scale_with_force: Tensor | bool
 
@@ -49,6 +51,10 @@ class Constants(nn.Module, abc.ABC):
     @abc.abstractmethod
     def value_of(self, z: Tensor) -> Tensor:
         """Return the constants in SI units for the parameters z, ``(*batch, ...)``."""
+
+    def parameters_of(self, values: Tensor) -> Tensor:
+        """Return z of constants ``(*batch, ...)``; NaN if they are beyond their limit."""
+        raise NotImplementedError(f"{type(self).__name__} has no inverse")
 
     def forward(self) -> Tensor:
         """Return the constants in SI units."""
@@ -75,19 +81,7 @@ class HasConstants(nn.Module):
         return constants
 
 
-class PositiveDefinite(Constants):
-    """Constants that are positive definite matrices, or positive numbers, above their limit."""
-
-    @abc.abstractmethod
-    def matrices(self) -> Tensor:
-        """Return the constants above their limit as matrices, ``(n, k, k)``."""
-
-    @abc.abstractmethod
-    def parameters_of(self, matrices: Tensor) -> Tensor:
-        """Return z of such matrices ``(*batch, n, k, k)``; NaN if they are not positive."""
-
-
-class PositiveConstants(PositiveDefinite):
+class PositiveConstants(Constants):
     """Log-normal constants start exp(spread z) + floor. The initial z is zero.
 
     Args:
@@ -97,6 +91,7 @@ class PositiveConstants(PositiveDefinite):
         floor: lower limit of the constants.
     """
 
+    positive = True
     start: Tensor
 
     def __init__(
@@ -118,11 +113,8 @@ class PositiveConstants(PositiveDefinite):
         values = self.start * torch.exp(self.spread * z)
         return values + self.lower if self.lower else values
 
-    def matrices(self) -> Tensor:
-        return (self() - self.lower)[:, None, None]
-
-    def parameters_of(self, matrices: Tensor) -> Tensor:
-        return torch.log(matrices[..., 0, 0] / self.start) / self.spread
+    def parameters_of(self, values: Tensor) -> Tensor:
+        return torch.log((values - self.lower) / self.start) / self.spread
 
 
 class SoftplusConstants(Constants):
@@ -168,7 +160,7 @@ class RealConstants(Constants):
         return self.spread * z
 
 
-class PhysicalBodies(PositiveDefinite):
+class PhysicalBodies(Constants):
     """Pseudo-inertias of n bodies. Each body has a positive density for all z::
 
         J = B U U^T B^T,    J_start = B B^T,    B = sqrt(m) [[S^(1/2), c], [0, 1]]
@@ -188,6 +180,7 @@ class PhysicalBodies(PositiveDefinite):
         bodies: n names.
     """
 
+    positive = True
     root: Tensor
     spread: Tensor
 
@@ -218,9 +211,6 @@ class PhysicalBodies(PositiveDefinite):
         """Return J_start, ``(n, 4, 4)``."""
         return self.root @ self.root.mT
 
-    def matrices(self) -> Tensor:
-        return self()
-
     def value_of(self, z: Tensor) -> Tensor:
         """Return J, ``(*batch, n, 4, 4)``, for z ``(*batch, n, 10)``."""
         a, d1, d2, d3, s12, s13, s23, t1, t2, t3 = (self.spread * z).unbind(-1)
@@ -235,9 +225,9 @@ class PhysicalBodies(PositiveDefinite):
         root = torch.exp(a)[..., None, None] * (self.root @ stretch)
         return root @ root.mT
 
-    def parameters_of(self, matrices: Tensor) -> Tensor:
+    def parameters_of(self, values: Tensor) -> Tensor:
         """Return z of pseudo-inertias, ``(*batch, n, 10)``; NaN without a positive density."""
-        whitened = torch.linalg.solve(self.root, torch.linalg.solve(self.root, matrices).mT)
+        whitened = torch.linalg.solve(self.root, torch.linalg.solve(self.root, values).mT)
         # Reversed rows and columns turn the lower Cholesky factor into an upper factor.
         factor, failed = torch.linalg.cholesky_ex(whitened.flip(-2, -1))
         stretch = torch.where(failed[..., None, None] == 0, factor, torch.nan).flip(-2, -1)

@@ -155,18 +155,17 @@ def _export_robot(model: Predictor, path: Path) -> Path:
     chain = chain.double()
     with torch.no_grad():
         drives, offset = model.drives, model.offset() @ model.offset_joints
-        stiffness = rest = springs = damping = torch.zeros_like(offset)
+        stiffness = rest = zero = torch.zeros_like(offset)
         if model.springs is not None:
             side = model.springs.stretch
-            stiffness, rest = (
-                model.springs.stiffness() @ side,
-                model.springs.rest_positions() @ side,
-            )
+            stiffness = model.springs.stiffness() @ side
+            rest = model.springs.rest_positions() @ side
         limit = torch.full_like(offset, torch.inf)
         if not drives.affine:
             limit[model.driven] = drives.largest_force()
-        if drives.takes_targets:
-            springs, damping = drives.springs(), drives.damping_rates()
+        springs, damping = (
+            zero if x is None else x for x in (drives.springs(), drives.damping_rates())
+        )
         constants_of_drives = model.physical_constants()[_BODY_COLUMNS:]
         fast = torch.full_like(model.viscous(), torch.inf)
         constants = RobotConstants(

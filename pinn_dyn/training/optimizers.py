@@ -90,7 +90,8 @@ class _Batch:
         """Take a step with the gradients of the parameters."""
         beta1, beta2 = group["betas"]
         gradient = self._gradient
-        torch._foreach_copy_(self._gradients, [_matrix(p.grad) for p in self.parameters])
+        gradients: list[Any] = [p.grad for p in self.parameters]
+        torch._foreach_copy_(self._gradients, [_matrix(x) for x in gradients])
         sides = [(gradient, gradient.mT), (gradient.mT, gradient)] if self._turns else []
         if not state:
             state["step"] = 0
