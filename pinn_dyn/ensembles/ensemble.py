@@ -38,11 +38,7 @@ class Ensemble(Predictor):
                 )
         self._models = nn.ModuleList(models)
         self.history_steps, self.input_history = first.history_steps, first.input_history
-
-    @property
-    def fixed_step(self) -> float | None:  # type: ignore[override]
-        """Step of discrete-time members in s, or None."""
-        return self.members[0].fixed_step
+        self.fixed_step = first.fixed_step
 
     @property
     def members(self) -> list[Predictor]:

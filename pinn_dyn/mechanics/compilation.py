@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from pinn_dyn.mechanics.integrators import RK4, Dynamics, Integrator
+from pinn_dyn.mechanics.integrators import RK4, Dynamics, Integrator, Wrapped
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
 
@@ -50,20 +50,6 @@ def integrated_by(model: ContinuousPredictor, integrator: Integrator) -> Iterato
         yield
     finally:
         model.integrator = original
-
-
-class Wrapped(Integrator):
-    """Integrator that takes the steps of an inner integrator and may compute paths differently."""
-
-    def __init__(self, inner: Integrator):
-        super().__init__(inner.substeps)
-        self.inner = inner
-        self.nodes, self.order, self.mean_input = inner.nodes, inner.order, inner.mean_input
-
-    def step(
-        self, dynamics: Dynamics, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
-    ) -> Tensor:
-        return self.inner.step(dynamics, increment, start, inputs, h)
 
 
 class CompiledDynamics(Wrapped):

@@ -154,7 +154,22 @@ class Rosenbrock(Integrator):
         return increment + h * (1.5 * first + 0.5 * second)
 
 
-class Sticking(Integrator):
+class Wrapped(Integrator):
+    """Integrator that takes the steps of an inner integrator and may compute paths differently."""
+
+    def __init__(self, inner: Integrator):
+        super().__init__(inner.substeps)
+        self.inner = inner
+        self.nodes, self.order, self.mean_input = inner.nodes, inner.order, inner.mean_input
+        self.implicit = inner.implicit
+
+    def step(
+        self, dynamics: Dynamics, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
+    ) -> Tensor:
+        return self.inner.step(dynamics, increment, start, inputs, h)
+
+
+class Sticking(Wrapped):
     """Integrator of systems with sticking friction, see :class:`~.sliding.Sliding`.
 
     The order is that of the inner method while no coordinate stops or starts to move, otherwise
@@ -164,12 +179,6 @@ class Sticking(Integrator):
     Args:
         inner: integration method of the motion in a step.
     """
-
-    def __init__(self, inner: Integrator):
-        super().__init__(inner.substeps)
-        self.inner = inner
-        self.nodes, self.order, self.mean_input = inner.nodes, inner.order, inner.mean_input
-        self.implicit = inner.implicit
 
     def step(
         self, dynamics: Any, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
