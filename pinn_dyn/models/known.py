@@ -82,6 +82,9 @@ class KnownMechanics(LearnedConstants):
             losses.
     """
 
+    offset_joints: Tensor
+    typical_force: Tensor
+
     def __init__(
         self,
         statistics: Statistics,
@@ -138,7 +141,9 @@ class KnownMechanics(LearnedConstants):
         self.sticking = self.friction.sticking
         self.integrator = with_friction(integrator, self.sticking)
         self.elastic = structure.springs() if isinstance(structure, ElasticJoints) else None
-        self._set_buffers(offsets, force)
+        unit = torch.eye(self.num_coordinates)
+        self.register_buffer("offset_joints", unit[offsets], persistent=False)
+        self.register_buffer("typical_force", force, persistent=False)
         self.float()
 
     def _set_resistance(
@@ -162,13 +167,6 @@ class KnownMechanics(LearnedConstants):
         index = [names.index(name) for name in springs]
         self.springs = JointSprings(scales, index) if springs else None
         return offsets
-
-    def _set_buffers(self, offsets: list[int], force: Tensor) -> None:
-        unit = torch.eye(self.num_coordinates)
-        self.register_buffer("offset_joints", unit[offsets], persistent=False)
-        self.register_buffer("typical_force", force, persistent=False)
-        self.offset_joints: Tensor
-        self.typical_force: Tensor
 
     def _typical_forces(
         self, statistics: Statistics, bodies: Tensor, driven: Tensor | None

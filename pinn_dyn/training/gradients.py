@@ -78,12 +78,9 @@ class Compiled:
             return None
         return CHUNK * MOST_EVALUATIONS // evaluations if on_cpu else len(windows)
 
-    def _loss(self, windows: Windows) -> Tensor:
-        with integrated_by(self.model, self._integrator):
-            laid_out = StateWindows.of(windows, self.model.state)
-            laid_out.x0.requires_grad_()  # so that all stages share a compiled function
-            return self.loss(self.model, laid_out)
-
     def _loss_and_gradient(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        loss = self._loss(windows)
+        laid_out = StateWindows.of(windows, self.model.state)
+        laid_out.x0.requires_grad_()  # so that all stages share a compiled function
+        with integrated_by(self.model, self._integrator):
+            loss = self.loss(self.model, laid_out)
         return loss.detach(), self.vector.gradient_of(loss)
