@@ -8,6 +8,7 @@ import torch
 from pydantic import PositiveFloat
 from torch import Tensor
 
+from pinn_dyn.mechanics.mechanical_terms import MechanicalTerms
 from pinn_dyn.models.known_constants import HasConstants, Named
 from pinn_dyn.models.scales import Scales
 
@@ -52,6 +53,21 @@ class Friction(HasConstants, abc.ABC):
         The default transmits the full drive force.
         """
         return force
+
+
+class HasFriction(MechanicalTerms):
+    """Part of a mechanical system whose dry friction is that of its head ``friction``."""
+
+    friction: Friction
+
+    def friction_force(self, v: Tensor) -> Tensor:
+        return self.friction(v)
+
+    def friction_slope(self, v: Tensor) -> Tensor:
+        return self.friction.slope(v)
+
+    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+        return self.friction.sliding(v, share)
 
 
 class NoFriction(Friction):

@@ -18,7 +18,7 @@ from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.drive_limits import DriveLimits
 from pinn_dyn.models.drives import Drives, TorqueDrives
-from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.friction import HasFriction, NoFriction
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants
@@ -34,7 +34,7 @@ _UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
 _GENERIC_SPREAD = 3.0
 
 
-class KnownMechanics(LearnedConstants):
+class KnownMechanics(HasFriction, LearnedConstants):
     """Rigid bodies with known kinematics and drives, and learned constants::
 
         (M(q) + diag(r)) a + C(q, v) v + G(q) + k_s (q - q_0) - o + D v + F(v) = A u
@@ -339,15 +339,6 @@ class KnownMechanics(LearnedConstants):
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
         bias = bias + self.spring_force(q) - self.constant_force()
         return mass + torch.diag(self.rotor_inertia()), bias
-
-    def friction_force(self, v: Tensor) -> Tensor:
-        return self.friction(v)
-
-    def friction_slope(self, v: Tensor) -> Tensor:
-        return self.friction.slope(v)
-
-    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
-        return self.friction.sliding(v, share)
 
 
 def _driven_joints(

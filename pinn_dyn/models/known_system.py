@@ -25,7 +25,8 @@ def _of_structure(name: str) -> Callable[..., Any]:
     """Build a method that calls the structure with the learned constants in its buffers."""
 
     def method(self: KnownSystem, *values: Tensor) -> Any:
-        learned = {f"model.{key}": part().view(self.shapes[key]) for key, part in self.parts()}
+        parts = self.learned.items()
+        learned = {f"model.{key}": part().view(self.shapes[key]) for key, part in parts}
         return functional_call(self.structure, learned, (name, *values))
 
     return method
@@ -75,10 +76,6 @@ class KnownSystem(LearnedConstants):
             self.learned[name] = PositiveConstants(start.flatten(), spread, names, units)
             self.shapes[name] = start.shape
         self.structure = Called(copy.deepcopy(structure), _term)
-
-    def parts(self) -> list[tuple[str, PositiveConstants]]:
-        """Return the constants by their names in the structure."""
-        return list(self.learned.items())  # type: ignore[arg-type]
 
     mass_matrix = _of_structure("mass_matrix")
     potential_energy = _of_structure("potential_energy")

@@ -11,7 +11,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator, MechanicalSystem, State
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky, Positive
-from pinn_dyn.models.friction import Friction
+from pinn_dyn.models.friction import Friction, HasFriction
 from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput, NoInput
 from pinn_dyn.models.potential import NetworkPotential, Potential
 from pinn_dyn.models.residual import ResidualHead
@@ -31,7 +31,7 @@ INPUT = partial(NetworkInput, hidden=(16, 16))
 """Default heads, those of the options named ``network`` in conf/model."""
 
 
-class StructuredNetwork(MechanicalSystem):
+class StructuredNetwork(HasFriction, MechanicalSystem):
     """Mechanical system with learned V, D, F, A and residual force. Subclasses add the mass.
 
     The scales of the heads come from the data: A ~ f/u with the root mean square f of the input,
@@ -102,15 +102,6 @@ class StructuredNetwork(MechanicalSystem):
 
     def typical_input(self, q: Tensor) -> Tensor:
         return self.input.typical_input(q)
-
-    def friction_force(self, v: Tensor) -> Tensor:
-        return self.friction(v)
-
-    def friction_slope(self, v: Tensor) -> Tensor:
-        return self.friction.slope(v)
-
-    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
-        return self.friction.sliding(v, share)
 
     def input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.input.force(q, u)
