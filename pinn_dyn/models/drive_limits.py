@@ -86,10 +86,10 @@ class DriveLimits(HasConstants):
         center, half = self._range(v)
         return (force - center).abs() > _LINEAR * half
 
-    def reachable(self, force: Tensor, v: Tensor) -> Tensor:
-        """Return the nearest force that a command can reach, ``(*batch, n)``."""
+    def reachable(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smallest and the largest force that a command can reach, ``(*batch, n)``."""
         center, half = self._range(v)
-        return force.clamp(center - _REACHABLE * half, center + _REACHABLE * half)
+        return center - _REACHABLE * half, center + _REACHABLE * half
 
     def at_rest(self) -> Tensor:
         """Return the largest torque at rest, min(L, S), ``(n,)``."""

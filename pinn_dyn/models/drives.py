@@ -134,10 +134,8 @@ class TorqueDrives(Drives):
     def force_range(self, v: Tensor) -> tuple[Tensor, Tensor] | None:
         if self.limits is None:
             return None
-        speed = v @ self.selection.mT
-        far = torch.full_like(speed, torch.inf)
-        smallest = self.limits.reachable(-far, speed) @ self.selection
-        return smallest, self.limits.reachable(far, speed) @ self.selection
+        smallest, largest = self.limits.reachable(v @ self.selection.mT)
+        return smallest @ self.selection, largest @ self.selection
 
     def saturated(self, v: Tensor, u: Tensor) -> Tensor:
         if self.limits is None:
