@@ -160,8 +160,10 @@ def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
     loss = IncrementLoss(one_step(size=2), model).double()
     batch = make_windows(25, size=2)
     compiled = engine(Compiled, loss, model, 100)
-    seen = []
-    monkeypatch.setattr(compiled, "_loss", lambda part: seen.append(len(part)) or loss(model, part))
+    seen, of_part = [], compiled._loss_and_gradient
+    monkeypatch.setattr(
+        compiled, "_loss_and_gradient", lambda part: seen.append(len(part)) or of_part(part)
+    )
     assert_same(compiled(batch), Eager(loss, model, compiled.vector)(batch))
     assert seen == [9, 8, 8]
 
