@@ -211,7 +211,7 @@ class AdaptiveTracking(ModelBasedLaw):
     def _inertia(self, memory: Tensor) -> Tensor:
         """Return J, ``(*batch, 4, 4)``."""
         z = memory[..., : self.sizes[0]] if self.sizes[0] else memory.new_zeros(10)
-        return self._bodies.inertia_of(z.unsqueeze(-2)).squeeze(-3)
+        return self._bodies.value_of(z.unsqueeze(-2)).squeeze(-3)
 
     def _constants(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the change of the ten parameters, f and o."""

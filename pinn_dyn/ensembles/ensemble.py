@@ -23,9 +23,6 @@ class Ensemble(Predictor):
 
     Raises:
         ValueError: if the sizes, states, steps or histories of the members differ.
-
-    Attributes:
-        members: the models.
     """
 
     def __init__(self, members: Iterable[Predictor]):
@@ -39,19 +36,16 @@ class Ensemble(Predictor):
                     f"the members differ in {name}: {sorted(values, key=str)}: train them with the "
                     "same settings but the seed"
                 )
-        self.members = nn.ModuleList(models)
+        self._models = nn.ModuleList(models)
         self.history_steps, self.input_history = first.history_steps, first.input_history
+        self.fixed_step = first.fixed_step
 
     @property
-    def fixed_step(self) -> float | None:  # type: ignore[override]
-        """Step of discrete-time members in s, or None."""
-        first: Any = self.members[0]
-        return first.fixed_step
+    def members(self) -> list[Predictor]:
+        return list(self._models)  # type: ignore[arg-type]
 
     def member_increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Return increments of each member, ``(E, *batch, T, 2N)``."""
-        members: Any = self.members
-        return torch.stack([model.increments(x0, t, input) for model in members])
+        return torch.stack([model.increments(x0, t, input) for model in self.members])
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         return self.member_increments(x0, t, input).mean(0)

@@ -10,7 +10,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.ensembles.ensemble import Ensemble
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.models.known_constants import Constants, PhysicalBodies, PositiveConstants
+from pinn_dyn.models.known_constants import Constants
 
 _STEPS_PER_DIMENSION = 10
 _MARGIN = 0.999  # of the way to the border of what is possible
@@ -69,9 +69,9 @@ class _Limits:
     """
 
     def __init__(self, model: nn.Module, size: int):
-        self.rate = torch.zeros(size, dtype=torch.float64)  # of positive constants, relative
-        self.factor, self.log_factor = self.rate.clone(), self.rate.clone()
-        self.bodies: list[tuple[PhysicalBodies, slice, Tensor]] = []
+        self.factor = torch.zeros(size, dtype=torch.float64)
+        self.log_factor = self.factor.clone()
+        self.parts: list[tuple[Constants, slice, Tensor, Tensor]] = []
         positions, first = {}, 0
         for parameter in model.parameters():
             positions[id(parameter)] = slice(first, first + parameter.numel())
@@ -80,32 +80,31 @@ class _Limits:
             if not isinstance(part, Constants):
                 continue
             where = positions[id(part.z)]
-            forces = torch.tensor(["N" in unit or "kg" in unit for unit in part.units]).double()
-            if isinstance(part, PositiveConstants):
-                self.rate[where], self.log_factor[where] = part.spread, forces / part.spread
-            elif isinstance(part, PhysicalBodies):
-                slopes = torch.func.jacrev(part.inertia_of)(part.z)
-                self.bodies.append((part, where, slopes.reshape(-1, part.z.numel())))
-                scale = torch.zeros_like(part.z)
-                scale[:, :1] = 0.5 / part.spread
-                self.log_factor[where] = scale.flatten()
-            else:
-                self.factor[where] = forces
+            if not part.positive:
+                self.factor[where] = torch.as_tensor(part.scale_with_force).double()
+                continue
+            values = part()
+            slopes = torch.func.jacrev(part.value_of)(part.z).reshape(-1, part.z.numel())
+            self.parts.append((part, where, values, slopes))
+            rise = torch.func.jvp(part.parameters_of, (values,), (values,))[1].flatten()
+            self.log_factor[where] = rise * part.scale_with_force
 
-    def inertias(self, shift: Tensor) -> list[Tensor]:
-        """Return the change of J of each group of bodies, ``(*batch, n, 4, 4)``."""
+    def changes(self, shift: Tensor) -> list[Tensor]:
+        """Return the change of the constants of each part, ``(*batch, n)`` or with matrices."""
         return [
-            (shift[..., part] @ slopes.T).unflatten(-1, (-1, 4, 4))
-            for _, part, slopes in self.bodies
+            (shift[..., where] @ slopes.T).unflatten(-1, values.shape)
+            for _, where, values, slopes in self.parts
         ]
 
     def reach(self, shift: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Return the least and the largest s for which shift + s direction is possible."""
-        # All factors 1 + s x of sizes and eigenvalues stay positive.
-        factors = [self.rate * direction / (1 + self.rate * shift)]
-        changes = zip(self.bodies, self.inertias(shift), self.inertias(direction), strict=True)
-        for (bodies, _, _), moved, change in changes:
-            root = torch.linalg.cholesky(bodies() + moved)
+        factors = []  # all factors 1 + s x of eigenvalues stay positive
+        changes = zip(self.parts, self.changes(shift), self.changes(direction), strict=True)
+        for (part, _, values, _), moved, change in changes:
+            if values.ndim == 1:
+                factors.append(change / (values + moved - part.lower))
+                continue
+            root = torch.linalg.cholesky(values + moved)
             half = torch.linalg.solve_triangular(root, change, upper=False)
             whitened = torch.linalg.solve_triangular(root, half.mT, upper=False)
             factors.append(torch.linalg.eigvalsh(whitened).flatten(1))
@@ -115,11 +114,10 @@ class _Limits:
 
     def parameters_of(self, z: Tensor, shift: Tensor) -> Tensor:
         """Return z of shifted bodies and constants, ``(*batch, P)``."""
-        rate = self.rate.clamp(min=1e-300)
-        values = z + torch.where(self.rate > 0, torch.log1p(rate * shift) / rate, shift)
-        for (bodies, part, _), moved in zip(self.bodies, self.inertias(shift), strict=True):
-            values[:, part] = bodies.parameters_of(bodies() + moved).flatten(1)
-        return values
+        parameters = z + shift
+        for (part, where, values, _), moved in zip(self.parts, self.changes(shift), strict=True):
+            parameters[:, where] = part.parameters_of(values + moved).flatten(1)
+        return parameters
 
 
 def _possible(limits: _Limits, root: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -11,7 +11,6 @@ from typing import Any
 import pandas as pd
 
 from pinn_dyn.data import DataSource, Splits
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.calibration import Calibration, calibration
 from pinn_dyn.evaluation.learned_terms import compare_with_source
 from pinn_dyn.evaluation.metrics import (
@@ -55,7 +54,7 @@ class Entry:
     name: str
     seed: int | None = None
     figures: Mapping[str, Any] = field(default_factory=dict)
-    members: Ensemble | None = None
+    members: Predictor | None = None
 
 
 def evaluate_models(

@@ -11,7 +11,6 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor
 
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.exports.latent_loop import LatentLoop
 from pinn_dyn.mechanics import (
@@ -153,7 +152,7 @@ def model_for_rollouts(
     copy = double_copy(model, device)
     if torch.device(device).type != "cpu":
         return copy
-    for part in copy.members if isinstance(copy, Ensemble) else [copy]:
+    for part in copy.members:
         if isinstance(part, ContinuousPredictor):
             part.integrator = CLoop(part.integrator, threads)
         elif isinstance(part, EncodedPredictor):
@@ -164,14 +163,12 @@ def model_for_rollouts(
 @torch.no_grad()
 def _roll_out(model: Predictor, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
     """Return the states ``(E, B, T, 2N)`` at the times t; E is 1 unless for an ensemble."""
-    if isinstance(model, Ensemble):
-        return x0[..., None, : 2 * model.num_coordinates] + model.member_increments(x0, t, input)
-    return model.predict(x0, t, input).unsqueeze(0)
+    return x0[..., None, : 2 * model.num_coordinates] + model.member_increments(x0, t, input)
 
 
 @torch.no_grad()
 def _velocities(model: Predictor, states: Tensor) -> Tensor | None:
-    if isinstance(model, Ensemble):
+    if len(model.members) > 1:
         return None
     q, v_or_p = states[0].split(model.num_coordinates, dim=-1)
     if model.state == "qv":

@@ -17,8 +17,7 @@ from pinn_dyn.exports.live_numbers import LiveNumbers
 from pinn_dyn.exports.program import Program
 from pinn_dyn.exports.repeated import programs, sharing
 from pinn_dyn.exports.scalar_code import c_function
-from pinn_dyn.mechanics.compilation import Wrapped
-from pinn_dyn.mechanics.integrators import Dynamics, Integrator
+from pinn_dyn.mechanics.integrators import Dynamics, Integrator, Wrapped
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
 

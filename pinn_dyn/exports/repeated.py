@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.exports.program import Program, trace
-from pinn_dyn.mechanics.compilation import Wrapped
-from pinn_dyn.mechanics.integrators import Sticking
+from pinn_dyn.mechanics.integrators import Sticking, Wrapped
 
 Function = Callable[[Tensor, Tensor], Tensor]
 
@@ -53,7 +52,7 @@ def sharing(model: Any) -> Any:
     an array. For any other model, it is the state derivative. The copy has the model's tensors.
     """
     shared, integrator = copy.copy(model), model.integrator
-    while isinstance(integrator, Wrapped):
+    while isinstance(integrator, Wrapped) and not isinstance(integrator, Sticking):
         integrator = integrator.inner
     n = model.num_coordinates
 

@@ -182,12 +182,12 @@ def _unexplained(
     robot: _LoadedRobot, runs: Sequence[Trajectory], cutoff: float, samples: int
 ) -> Tensor:
     """Return the unexplained share of each torque with the best load, ``(N,)``."""
-    motion = filtered_motion([_marked(run, 1.0) for run in runs], cutoff, samples)
-    at = robot.samples(*motion)
-    moves = motion.v.abs() > REST * motion.v.std(0)
+    q, v, a, u = filtered_motion([_marked(run, 1.0) for run in runs], cutoff, samples)
+    at = robot.samples(q, v, a, u)
+    moves = v.abs() > REST * v.std(0)
     with torch.no_grad():
         force, rows = at.missing_force() * moves, at.rows * moves[..., None]
-        drive = robot.known.motor_force(motion.q, motion.v, motion.u[:, :-1]) * moves
+        drive = robot.known.motor_force(q, v, u[:, :-1]) * moves
     flat = rows.flatten(0, 1)
     load = torch.linalg.lstsq(flat, -force.flatten()[:, None], driver="gelsd").solution
     return (force + (rows @ load)[..., 0]).norm(dim=0) / drive.norm(dim=0)

@@ -100,12 +100,9 @@ class Integrator(abc.ABC):
 class RK4(Integrator):
     """The four-stage, fourth-order 3/8 rule::
 
-        k1 = f(x, u(t))                       k2 = f(x + h k1/3, u(t + h/3))
-        k3 = f(x + h (k2 - k1/3), u(t + 2h/3))   k4 = f(x + h (k1 - k2 + k3), u(t + h))
-        x(t + h) = x + h (k1 + 3 k2 + 3 k3 + k4)/8
-
-    Paths are computed by torchdiffeq. :meth:`step` gives the same numbers up to rounding, by
-    operations that can be traced.
+    k1 = f(x, u(t))                       k2 = f(x + h k1/3, u(t + h/3))
+    k3 = f(x + h (k2 - k1/3), u(t + 2h/3))   k4 = f(x + h (k1 - k2 + k3), u(t + h))
+    x(t + h) = x + h (k1 + 3 k2 + 3 k3 + k4)/8
     """
 
     nodes = (0.0, 1 / 3, 2 / 3, 1.0)
@@ -120,19 +117,6 @@ class RK4(Integrator):
         third = f(start + (increment + h * (second - first / 3)), inputs[2])
         fourth = f(start + (increment + h * (first - second + third)), inputs[3])
         return increment + h * (first + 3 * (second + third) + fourth) / 8
-
-    def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        from torchdiffeq import odeint  # imports scipy.integrate, which takes a second
-
-        f = dynamics.state_derivative
-
-        def rate(time: Tensor, increment: Tensor) -> Tensor:
-            return f(start + increment, signal(time))
-
-        # For a held input torchdiffeq moves the stages at both ends of a step inwards.
-        held = signal.interpolation == "hold"
-        zero = torch.zeros_like(start)
-        return odeint(rate, zero, grid, method="rk4", options={"perturb": held})
 
 
 _GAMMA = 1 - 1 / math.sqrt(2)
@@ -170,7 +154,22 @@ class Rosenbrock(Integrator):
         return increment + h * (1.5 * first + 0.5 * second)
 
 
-class Sticking(Integrator):
+class Wrapped(Integrator):
+    """Integrator that takes the steps of an inner integrator and may compute paths differently."""
+
+    def __init__(self, inner: Integrator):
+        super().__init__(inner.substeps)
+        self.inner = inner
+        self.nodes, self.order, self.mean_input = inner.nodes, inner.order, inner.mean_input
+        self.implicit = inner.implicit
+
+    def step(
+        self, dynamics: Dynamics, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
+    ) -> Tensor:
+        return self.inner.step(dynamics, increment, start, inputs, h)
+
+
+class Sticking(Wrapped):
     """Integrator of systems with sticking friction, see :class:`~.sliding.Sliding`.
 
     The order is that of the inner method while no coordinate stops or starts to move, otherwise
@@ -180,12 +179,6 @@ class Sticking(Integrator):
     Args:
         inner: integration method of the motion in a step.
     """
-
-    def __init__(self, inner: Integrator):
-        super().__init__(inner.substeps)
-        self.inner = inner
-        self.nodes, self.order, self.mean_input = inner.nodes, inner.order, inner.mean_input
-        self.implicit = inner.implicit
 
     def step(
         self, dynamics: Any, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor

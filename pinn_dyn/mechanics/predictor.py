@@ -58,6 +58,15 @@ class Predictor(nn.Module, abc.ABC):
         x0 is ``(*batch, 2N)``, t ``(T,)`` are times in s, and ``input`` is u of the same batch.
         """
 
+    @property
+    def members(self) -> list[Predictor]:
+        """Members of an ensemble. A single model is its only member."""
+        return [self]
+
+    def member_increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
+        """Return :meth:`increments` of each of E members, ``(E, *batch, T, 2N)``."""
+        return self.increments(x0, t, input).unsqueeze(0)
+
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return a scalar that training adds to the loss, at data q, v, a and u ``(B, N or M)``."""
         return q.new_zeros(())

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,8 +33,9 @@ def rollout(
         substeps: steps of the integrator between two times of ``t``.
     """
     require_start(x0, t, input)
-    path = path_between(_Flow(derivative), RK4(substeps), x0, t, input)
-    return x0.unsqueeze(-2) + path
+    flow: Any = SimpleNamespace(state_derivative=derivative)
+    flow.integration_step = partial(RK4().step, flow)
+    return x0.unsqueeze(-2) + path_between(flow, RK4(substeps), x0, t, input)
 
 
 def require_start(x0: Tensor, t: Tensor, input: Signal) -> None:
@@ -73,16 +76,3 @@ def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
     nearest = torch.where(grid - before < after - grid, before, after)
     close = (grid - nearest).abs() < 1e-6 * (t[1:] - t[:-1]).min() / substeps
     return torch.where(close, nearest, grid)
-
-
-@dataclass(frozen=True)
-class _Flow:
-    state_derivative: Callable[[Tensor, Tensor], Tensor]
-
-    def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        return lambda rate: rate
-
-    def integration_step(
-        self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
-    ) -> Tensor:
-        return RK4().step(self, increment, start, inputs, h)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -113,22 +112,6 @@ class Signal:
         made.__dict__.update(t=t, u=u, interpolation=self.interpolation, rate=rate)
         return made
 
-    def __call__(self, time: Tensor | float) -> Tensor:
-        """Return u at a time, ``(*batch, M)``. At a jump, return the value after it."""
-        now, times = float(time), self._times
-        last = len(times) - 1
-        index = min(max(bisect.bisect_right(times, now) - 1, 0), last)
-        if self.interpolation == "hold" or index == last:
-            return self._samples[index]
-        span = times[index + 1] - times[index]
-        share = max((now - times[index]) / span, 0.0)
-        if self._rates is None:
-            return torch.lerp(self._samples[index], self._samples[index + 1], share)
-        # Outside the samples the share is 0, and the rates have no weight.
-        weights = torch.tensor(share, dtype=self.u.dtype, device=self.u.device)
-        low, high = self._samples[index : index + 2]
-        return _combined(_cubic(weights), low, high, *(span * self._rates[index : index + 2]))
-
     def at(self, times: Tensor) -> Tensor:
         """Return u at times ``(T,)``, ``(T, *batch, M)``. At a jump, return the value after it."""
         return self._at(times, torch.searchsorted(self.t, times, right=True) - 1)
@@ -154,57 +137,46 @@ class Signal:
     # Samples are the first dimension, (K, *batch, M), so a row is contiguous.
 
     @cached_property
-    def _times(self) -> list[float]:
-        return self.t.to(self.u.dtype).tolist()
+    def _spans(self) -> Tensor:
+        """Times between samples, ``(K,)``; 1 after the last sample."""
+        return torch.cat([self.t.diff(), torch.ones_like(self.t[:1])])
 
     @cached_property
-    def _samples(self) -> Tensor:
-        return self.u.movedim(-2, 0).contiguous()
-
-    @cached_property
-    def _rates(self) -> Tensor | None:
-        return None if self.rate is None else self.rate.movedim(-2, 0).contiguous()
+    def _coefficients(self) -> list[Tensor]:
+        """Coefficients c of u = c_0 + c_1 s + ... after each sample, ``(K, *batch, M)`` each."""
+        samples = self.u.movedim(-2, 0).contiguous()
+        if self.interpolation == "hold":
+            return [samples]
+        rise = torch.cat([samples.diff(dim=0), torch.zeros_like(samples[:1])])
+        if self.rate is None:
+            return [samples, rise]
+        scaled = self.rate.movedim(-2, 0)
+        span = self._beside(self._spans)
+        start = torch.cat([span[:-1] * scaled[:-1], torch.zeros_like(samples[:1])])
+        end = torch.cat([span[:-1] * scaled[1:], torch.zeros_like(samples[:1])])
+        return [samples, start, 3 * rise - 2 * start - end, start + end - 2 * rise]
 
     def _beside(self, values: Tensor) -> Tensor:
         return values.reshape(*values.shape, *[1] * (self.u.ndim - 1)).to(self.u)
 
     def _at(self, times: Tensor, index: Tensor) -> Tensor:
         """Return u at times. ``index`` is the sample before each time, -1 before the first."""
-        last = self.t.shape[0] - 1
-        if self.interpolation == "hold" or last == 0:
-            return self._samples[index.clamp(0, last)]
-        index = index.clamp(0, last - 1)
-        span = self.t[index + 1] - self.t[index]
-        share = self._beside(((times - self.t[index]) / span).clamp(0, 1))
-        low, high = self._samples[index], self._samples[index + 1]
-        if self._rates is None:
-            return torch.lerp(low, high, share)
-        rates = (self._beside(span) * self._rates[k] for k in (index, index + 1))
-        return _combined(_cubic(share), low, high, *rates)
+        index = index.clamp(min=0)
+        constant, *slopes = (values[index] for values in self._coefficients)
+        share = ((times - self.t[index]) / self._spans[index]).clamp(0, 1)
+        return constant + _polynomial(self._beside(share), slopes)
 
     def _integral(self, grid: Tensor) -> Tensor:
         """Return the integral of u from t_0 to each time, ``(T, *batch, M)``."""
-        samples, rates, last = self._samples, self._rates, self.t.shape[0] - 1
         index = (torch.searchsorted(self.t, grid, right=True) - 1).clamp(min=0)
-        elapsed = self._beside(grid - self.t[index])
-        span = self._beside(self.t.diff())
-        if self.interpolation == "hold":
-            areas, height = samples[:-1] * span, samples[index]
-        else:
-            areas = span * (samples[:-1] + samples[1:]) / 2
-            following = (index + 1).clamp(max=last)
-            length = self._beside(self.t[following] - self.t[index])
-            # Zero beyond the ends, where u is constant.
-            inside = length > 0
-            share = torch.where(inside, elapsed.clamp(min=0) / torch.where(inside, length, 1), 0)
-            if rates is None:
-                height = torch.lerp(samples[index], samples[following], share / 2)
-            else:
-                areas = areas + span.square() * (rates[:-1] - rates[1:]) / 12
-                scaled = length * rates[index], length * rates[following]
-                height = _combined(_cubic_mean(share), samples[index], samples[following], *scaled)
-        total = torch.cat([torch.zeros_like(samples[:1]), areas]).cumsum(0)
-        return total[index] + height * elapsed
+        constant, *slopes = self._coefficients
+        slopes = [values / (k + 2) for k, values in enumerate(slopes)]
+        span, elapsed = self._beside(self._spans), self._beside(grid - self.t[index])
+        share = (elapsed / span[index]).clamp(0, 1)
+        areas = span * (constant + sum(slopes))
+        total = torch.cat([torch.zeros_like(areas[:1]), areas[:-1]]).cumsum(0)
+        mean = constant[index] + _polynomial(share, [values[index] for values in slopes])
+        return total[index] + mean * elapsed
 
 
 def stacked(signals: Sequence[Signal], t: Tensor) -> Signal:
@@ -221,22 +193,9 @@ def _rates(t: Tensor, u: Tensor) -> Tensor:
     return torch.gradient(u, spacing=(t.to(u),), dim=-2, edge_order=order)[0]
 
 
-def _cubic(s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return weights of u_k, u_{k+1}, h r_k and h r_{k+1} at s."""
-    square, cube = s**2, s**3
-    rise = 3 * square - 2 * cube
-    return 1 - rise, rise, s - 2 * square + cube, cube - square
-
-
-def _cubic_mean(s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the means of the weights of :func:`_cubic` over 0 to s."""
-    square, cube = s**2, s**3
-    rise = square - cube / 2
-    return 1 - rise, rise, s / 2 - 2 * square / 3 + cube / 4, cube / 4 - square / 3
-
-
-def _combined(
-    weights: tuple[Tensor, ...], low: Tensor, high: Tensor, low_rate: Tensor, high_rate: Tensor
-) -> Tensor:
-    a, b, c, d = weights
-    return a * low + b * high + c * low_rate + d * high_rate
+def _polynomial(s: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
+    """Return c_1 s + c_2 s^2 + ..., by Horner's rule."""
+    value = torch.zeros_like(s)
+    for factor in reversed(coefficients):
+        value = s * (factor + value)
+    return value

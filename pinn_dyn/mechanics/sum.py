@@ -62,8 +62,6 @@ class Sum(MechanicalSystem):
     input_force = _total("input_force")
     applied_force = _total("applied_force")
     _residual_force = _total("_residual_force")
-    _kinetic_gradient = _total("_kinetic_gradient")
-    _momentum = _total("_momentum")
 
     def mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         (mass, bias), *terms = (part.mass_and_bias(q, v) for part in self._systems())

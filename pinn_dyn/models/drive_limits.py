@@ -61,20 +61,19 @@ class DriveLimits(HasConstants):
                 f"limits has limit {limit}, stall {stall} and no_load_speed {no_load_speed}, "
                 "expected a limit, or stall and no_load_speed together, or all three"
             )
-        joints, unlimited = scales.joints, torch.finfo(torch.float32).max
-        forces = [joint.force for joint in joints]
+        unlimited = torch.finfo(torch.float32).max
         speed = torch.full_like(scales.value, float(scales.statistics.v_std.mean()))
         self.learned = nn.ModuleDict()
-        for name, label, value, typical, units in (
-            ("limit", "torque limit", limit, scales.value, forces),
-            ("stall", "stall torque", stall, 2 * scales.value, forces),
-            ("speed", "no-load speed", no_load_speed, 3 * speed, [x.speed for x in joints]),
+        for name, label, value, typical, quantity in (
+            ("limit", "torque limit", limit, scales.value, "force"),
+            ("stall", "stall torque", stall, 2 * scales.value, "force"),
+            ("speed", "no-load speed", no_load_speed, 3 * speed, "speed"),
         ):
             if value == "learned":
-                self.learned[name] = scales.positive(label, 1.0, typical, spread or 1.0, units)
+                self.learned[name] = scales.positive(label, 1.0, typical, spread or 1.0, quantity)
                 value = None
             number = torch.as_tensor(unlimited if value is None else value, dtype=torch.float32)
-            self.register_buffer(f"fixed_{name}", number.expand(len(joints)).clone())
+            self.register_buffer(f"fixed_{name}", number.expand(len(scales.joints)).clone())
 
     def forward(self, force: Tensor, v: Tensor) -> Tensor:
         """Return tau, ``(*batch, n)``, for the commanded force s at the velocity v."""
@@ -87,10 +86,10 @@ class DriveLimits(HasConstants):
         center, half = self._range(v)
         return (force - center).abs() > _LINEAR * half
 
-    def reachable(self, force: Tensor, v: Tensor) -> Tensor:
-        """Return the nearest force that a command can reach, ``(*batch, n)``."""
+    def reachable(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smallest and the largest force that a command can reach, ``(*batch, n)``."""
         center, half = self._range(v)
-        return force.clamp(center - _REACHABLE * half, center + _REACHABLE * half)
+        return center - _REACHABLE * half, center + _REACHABLE * half
 
     def at_rest(self) -> Tensor:
         """Return the largest torque at rest, min(L, S), ``(n,)``."""

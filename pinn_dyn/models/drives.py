@@ -24,7 +24,6 @@ class Drives(HasConstants, InputMatrix):
         gain: learned drive gains, or None.
         identified_by_forces: true if filtering the input has the same effect as filtering the
             force, which allows a fit of filtered forces.
-        limited: true if some commands exceed the largest force.
         takes_targets: true if the inputs are target positions instead of forces.
         initial_strength: :meth:`strength` at the start, ``(n,)``.
 
@@ -35,7 +34,6 @@ class Drives(HasConstants, InputMatrix):
 
     gain: Constants | None
     identified_by_forces: bool = True
-    limited: bool = False
     takes_targets: bool = False
     selection: Tensor
     initial_strength: Tensor
@@ -57,14 +55,6 @@ class Drives(HasConstants, InputMatrix):
     @abc.abstractmethod
     def largest_force(self) -> Tensor:
         """Return the largest force of each drive at rest, ``(n,)``."""
-
-    def springs(self) -> Tensor:
-        """Return the stiffness that the drives add to the joints, ``(N,)``."""
-        return torch.zeros_like(self.selection[0])
-
-    def damping_rates(self) -> Tensor:
-        """Return the damping that the drives add to the joints, ``(N,)``."""
-        return torch.zeros_like(self.selection[0])
 
     def largest_input(self) -> Tensor | None:
         """Return the input of the largest force at rest, ``(n,)``, or None without limits."""
@@ -100,19 +90,16 @@ class TorqueDrives(Drives):
         joints: Sequence[NonNegativeInt] | None = None,
     ):
         super().__init__(scales, joints)
-        motors = tuple(scales.joints[k] for k in self.joints)
+        motors = scales.restricted(self.joints)
         self._force = scales.value
-        start = torch.as_tensor(gain, dtype=torch.float64).expand(len(motors))
+        start = torch.as_tensor(gain, dtype=torch.float64).expand(len(self.joints))
         if gain_spread > 0:
-            units = [f"{joint.force}/u" for joint in motors]
-            named = replace(scales, named=motors)
-            self.gain = named.positive("drive gain", 1.0, start, gain_spread, units)
+            self.gain = motors.positive("drive gain", 1.0, start, gain_spread, "gain")
         self.register_buffer("initial_strength", start.clone())
         self.limits: DriveLimits | None = None
         if limits is not None:
-            force = scales.value[self.joints]
-            self.limits = limits(replace(scales, named=motors, value=force))
-            self.affine, self.limited = False, True
+            self.limits = limits(replace(motors, value=scales.value[self.joints]))
+            self.affine = False
             # A fit of filtered forces with learned limits would find zero limits and zero bodies.
             self.identified_by_forces = not self.limits.learned
 
@@ -147,10 +134,8 @@ class TorqueDrives(Drives):
     def force_range(self, v: Tensor) -> tuple[Tensor, Tensor] | None:
         if self.limits is None:
             return None
-        speed = v @ self.selection.mT
-        far = torch.full_like(speed, torch.inf)
-        smallest = self.limits.reachable(-far, speed) @ self.selection
-        return smallest, self.limits.reachable(far, speed) @ self.selection
+        smallest, largest = self.limits.reachable(v @ self.selection.mT)
+        return smallest @ self.selection, largest @ self.selection
 
     def saturated(self, v: Tensor, u: Tensor) -> Tensor:
         if self.limits is None:

@@ -8,6 +8,7 @@ import torch
 from pydantic import PositiveFloat
 from torch import Tensor
 
+from pinn_dyn.mechanics.mechanical_terms import MechanicalTerms
 from pinn_dyn.models.known_constants import HasConstants, Named
 from pinn_dyn.models.scales import Scales
 
@@ -52,6 +53,21 @@ class Friction(HasConstants, abc.ABC):
         The default transmits the full drive force.
         """
         return force
+
+
+class HasFriction(MechanicalTerms):
+    """Part of a mechanical system whose dry friction is that of its head ``friction``."""
+
+    friction: Friction
+
+    def friction_force(self, v: Tensor) -> Tensor:
+        return self.friction(v)
+
+    def friction_slope(self, v: Tensor) -> Tensor:
+        return self.friction.slope(v)
+
+    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+        return self.friction.sliding(v, share)
 
 
 class NoFriction(Friction):
@@ -99,11 +115,9 @@ class CoulombFriction(Friction):
         if width is None:
             width = 0.03 if scales.prior else 0.1
         self.sticking = scales.prior if sticking is None else sticking
-        forces = [joint.force for joint in scales.joints]
-        speeds = [joint.speed for joint in scales.joints]
         v_std, floor = scales.statistics.v_std, _SMALLEST_WIDTH
-        self.level = scales.positive("Coulomb friction", level, scales.value, spread, forces)
-        self.width = scales.positive("friction width", width, v_std, spread, speeds, floor)
+        self.level = scales.positive("Coulomb friction", level, scales.value, spread, "force")
+        self.width = scales.positive("friction width", width, v_std, spread, "speed", floor)
         self._add_constants(scales)
 
     def _add_constants(self, scales: Scales) -> None:
@@ -151,8 +165,7 @@ class AsymmetricCoulomb(CoulombFriction):
     def _add_constants(self, scales: Scales) -> None:
         # c+ is the level times the asymmetry, c- is the level divided by the asymmetry.
         ones = torch.ones(scales.size, dtype=scales.value.dtype)
-        units = ["1"] * scales.size
-        self.ratio = scales.positive("friction asymmetry", 1.0, ones, 0.5, units)
+        self.ratio = scales.positive("friction asymmetry", 1.0, ones, 0.5, "ratio")
 
     def _levels(self) -> list[Named]:
         level, ratio = self.level(), self.ratio()
@@ -176,8 +189,8 @@ class Stribeck(AsymmetricCoulomb):
     def _add_constants(self, scales: Scales) -> None:
         super()._add_constants(scales)
         v_std = scales.statistics.v_std
-        self.rise = scales.positive("Stribeck rise", 0.03, scales.value, 1.0, self.level.units)
-        self.speed = scales.positive("Stribeck speed", 0.3, v_std, 1.0, self.width.units)
+        self.rise = scales.positive("Stribeck rise", 0.03, scales.value, 1.0, "force")
+        self.speed = scales.positive("Stribeck speed", 0.3, v_std, 1.0, "speed")
 
     def physical_constants(self) -> list[Named]:
         return [*super().physical_constants(), self.rise.named(), self.speed.named()]
@@ -208,7 +221,7 @@ class LoadDependent(AsymmetricCoulomb):
     def _add_constants(self, scales: Scales) -> None:
         super()._add_constants(scales)
         ones = torch.ones(scales.size, dtype=scales.value.dtype)
-        self.odds = scales.positive("loss by load", 0.05, ones, 1.0, ["1"] * scales.size)
+        self.odds = scales.positive("loss by load", 0.05, ones, 1.0, "ratio")
 
     def physical_constants(self) -> list[Named]:
         loss = self.odds.named()._replace(values=self._loss())

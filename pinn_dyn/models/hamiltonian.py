@@ -68,10 +68,6 @@ class HamiltonianNetwork(structured.StructuredNetwork):
                 "M^-1 = L L^T already suits chains: set model.inverse_mass.transposed=false"
             )
 
-    def inverse_mass_matrix(self, q: Tensor) -> Tensor:
-        """Return W(q) = M(q)^-1 = L L^T, ``(*batch, N, N)``."""
-        return self.inverse_mass.matrix(q)
-
     def mass_matrix(self, q: Tensor) -> Tensor:
         # Avoid cholesky_inverse, whose forward-mode derivative is wrong in torch 2.13.
         factor = self.inverse_mass(q)
@@ -91,13 +87,6 @@ class HamiltonianNetwork(structured.StructuredNetwork):
 
     def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
         return self.inverse_mass.product(q, p)
-
-    def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return d(v^T M v / 2)/dq at fixed v = -d(p^T W p / 2)/dq at fixed p = M v."""
-        factor, tape = self.inverse_mass.linearize(q)
-        w = lower_solve(factor, v)
-        p = upper_solve(factor, w)
-        return -self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
 
     def inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """Return M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v."""

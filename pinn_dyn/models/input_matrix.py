@@ -38,25 +38,13 @@ class InputMatrix(nn.Module, abc.ABC):
         """Return the force of the inputs without springs and damping, ``(*batch, N)``."""
         return self.force(q, u)
 
-    def spring_energy(self, q: Tensor) -> Tensor | float:
-        """Return the spring energy of the drives, ``(*batch,)``, J."""
-        return 0.0
-
-    def spring_force(self, q: Tensor) -> Tensor | float:
-        """Return the gradient of the spring energy of the drives, ``(*batch, N)``."""
-        return 0.0
-
-    def stiffness_matrix(self) -> Tensor | None:
-        """Return the stiffness of the drives, ``(N, N)``, or None."""
+    def springs(self) -> Tensor | None:
+        """Return the stiffness that the drives add to the coordinates, ``(N,)``, or None."""
         return None
 
-    def damping_matrix(self) -> Tensor | float:
-        """Return the damping of the drives, ``(N, N)``."""
-        return 0.0
-
-    def damping_force(self, v: Tensor) -> Tensor | float:
-        """Return the damping force of the drives, ``(*batch, N)``."""
-        return 0.0
+    def damping_rates(self) -> Tensor | None:
+        """Return the damping that the drives add to the coordinates, ``(N,)``, or None."""
+        return None
 
     def typical_input(self, q: Tensor) -> Tensor:
         """Return a typical input ``(*batch, M)``, for a force that is not linear in the input."""

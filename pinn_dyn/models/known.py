@@ -18,7 +18,7 @@ from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.drive_limits import DriveLimits
 from pinn_dyn.models.drives import Drives, TorqueDrives
-from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.friction import HasFriction, NoFriction
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants
@@ -34,7 +34,7 @@ _UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
 _GENERIC_SPREAD = 3.0
 
 
-class KnownMechanics(LearnedConstants):
+class KnownMechanics(HasFriction, LearnedConstants):
     """Rigid bodies with known kinematics and drives, and learned constants::
 
         (M(q) + diag(r)) a + C(q, v) v + G(q) + k_s (q - q_0) - o + D v + F(v) = A u
@@ -81,6 +81,9 @@ class KnownMechanics(LearnedConstants):
             springs, ``spread`` names unknown bodies, or ``input`` is combined with limits or
             losses.
     """
+
+    offset_joints: Tensor
+    typical_force: Tensor
 
     def __init__(
         self,
@@ -137,8 +140,10 @@ class KnownMechanics(LearnedConstants):
         self.input_affine = self.drives.affine and not self.friction.by_load
         self.sticking = self.friction.sticking
         self.integrator = with_friction(integrator, self.sticking)
-        self.elastic = Springs(structure) if isinstance(structure, ElasticJoints) else None
-        self._set_buffers(offsets, force)
+        self.elastic = structure.springs() if isinstance(structure, ElasticJoints) else None
+        unit = torch.eye(self.num_coordinates)
+        self.register_buffer("offset_joints", unit[offsets], persistent=False)
+        self.register_buffer("typical_force", force, persistent=False)
         self.float()
 
     def _set_resistance(
@@ -148,31 +153,20 @@ class KnownMechanics(LearnedConstants):
         joints, force = scales.joints, scales.value.double()
         inertia = force / statistics.acceleration.double()
         damping = force / statistics.v_std.double()
-        motors = replace(scales, named=tuple(joints[k] for k in self.driven))
-        units = [joint.inertia for joint in motors.joints]
-        self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, units)
-        units = [joint.damping for joint in joints]
-        self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, units)
+        motors = scales.restricted(self.driven)
+        self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, "inertia")
+        self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, "damping")
         names = self.structure.joint_names
         offsets = [k for k in self.driven if names[k] not in springs]
         kinds = ["torque" if joints[k].turns else "force" for k in offsets]
         self.offset = RealConstants(
             0.3 * force[offsets],
             [f"{kind} offset of {names[k]}" for kind, k in zip(kinds, offsets, strict=True)],
-            [joints[k].force for k in offsets],
+            [joints[k].unit("force") for k in offsets],
         )
         index = [names.index(name) for name in springs]
         self.springs = JointSprings(scales, index) if springs else None
         return offsets
-
-    def _set_buffers(self, offsets: list[int], force: Tensor) -> None:
-        unit = torch.eye(self.num_coordinates)
-        self.register_buffer("motors", unit[self.driven], persistent=False)
-        self.register_buffer("offset_joints", unit[offsets], persistent=False)
-        self.register_buffer("typical_force", force, persistent=False)
-        self.motors: Tensor
-        self.offset_joints: Tensor
-        self.typical_force: Tensor
 
     def _typical_forces(
         self, statistics: Statistics, bodies: Tensor, driven: Tensor | None
@@ -194,11 +188,8 @@ class KnownMechanics(LearnedConstants):
 
     def drive_gain(self) -> Tensor:
         """Return k, ``(N,)``; 1 for passive joints."""
-        return self.input_gain() @ self.motors + (1 - self.motors.sum(0))
-
-    def input_gain(self) -> Tensor:
-        """Return k of the driven joints, or the strength of other drives, ``(M,)``."""
-        return self.drives.strength()
+        driven = self.drives.selection
+        return self.drives.strength() @ driven + (1 - driven.sum(0))
 
     def constant_force(self) -> Tensor:
         """Return o, or k_s q_0 of joints with a spring, ``(N,)``; 0 for other passive joints."""
@@ -207,7 +198,11 @@ class KnownMechanics(LearnedConstants):
 
     def rotor_inertia(self) -> Tensor:
         """Return r, ``(N,)``; 0 for passive joints."""
-        return self.armature() @ self.motors
+        return self.armature() @ self.drives.selection
+
+    def all_springs(self) -> list[Springs]:
+        """Return the springs of joints, and those of elastic joints."""
+        return [part for part in (self.springs, self.elastic) if part is not None]
 
     def physical_constants(self) -> list[Named]:
         """Return bodies, drives, friction and gains in SI units."""
@@ -219,7 +214,7 @@ class KnownMechanics(LearnedConstants):
             constants.append(Named(names, [unit] * len(names), values, lower))
         drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
         if self.elastic is not None:
-            drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
+            drives += self.elastic.physical_constants()
         drives += self.friction.physical_constants()
         drives += self.drives.physical_constants()
         if self.springs is not None:
@@ -257,16 +252,14 @@ class KnownMechanics(LearnedConstants):
     def drive_force(
         self, q: Tensor, v: Tensor, a: Tensor, u: Tensor, share: Tensor | None = None
     ) -> Tensor:
-        """Return r a + D v + F + k_s q - o - motor force, ``(*batch, N)``.
+        """Return r a + D v + F - o - motor force, ``(*batch, N)``.
 
         Without ``share``, F is the smooth law. With the share of forward motion, F is the sliding
-        friction. The terms Y pi and the forces of elastic joints are not included.
+        friction. The terms Y pi and the forces of springs are not included.
         """
         friction = self.friction(v) if share is None else self.friction.sliding(v, share)
         resistance = self.rotor_inertia() * a + self.viscous() * v + friction
-        if self.springs is not None:
-            resistance = resistance + self.springs.springs() * q
-        return resistance - self.constant_force() - self.motor_force(q, v, u)
+        return resistance - self.offset() @ self.offset_joints - self.motor_force(q, v, u)
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
         """Return the ratio of fitted to initial forces per input, and its largest likely value.
@@ -278,7 +271,7 @@ class KnownMechanics(LearnedConstants):
         initial = self.structure.rigid_force(q, v, a, self.bodies.start(), gravity=True)
         ratio = (fitted + self.rotor_inertia() * a).norm(dim=0) / initial.norm(dim=0)
         ratio = torch.where(initial.norm(dim=0) > 0, ratio, 1.0)  # a motor has no body
-        gain_ratio = self.input_gain() / self.drives.initial_strength
+        gain_ratio = self.drives.strength() / self.drives.initial_strength
         return ratio[self.driven] / gain_ratio, self._largest_ratio
 
     def slopes(self) -> KnownSlopes:
@@ -297,9 +290,10 @@ class KnownMechanics(LearnedConstants):
         return energy + ((0.5 * self.spring_force(q) - self.constant_force()) * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        matrix = torch.diag(self.viscous()) + self.drives.damping_matrix()
-        if self.elastic is not None:
-            matrix = matrix + self.elastic.matrices()[1]
+        rates, drives = self.viscous(), self.drives.damping_rates()
+        matrix = torch.diag(rates if drives is None else rates + drives)
+        for springs in self.all_springs():
+            matrix = matrix + springs.matrices()[1]
         return matrix.expand(*q.shape, -1)
 
     def input_matrix(self, q: Tensor) -> Tensor:
@@ -322,12 +316,9 @@ class KnownMechanics(LearnedConstants):
         return tau.clamp(smallest, largest)
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        drives = self.drives.stiffness_matrix()
-        matrices = [] if drives is None else [drives]
-        if self.springs is not None:
-            matrices.append(torch.diag(self.springs.springs()))
-        if self.elastic is not None:
-            matrices.append(self.elastic.matrices()[0])
+        drives = self.drives.springs()
+        matrices = [] if drives is None else [torch.diag(drives)]
+        matrices += [springs.matrices()[0] for springs in self.all_springs()]
         return torch.stack(matrices).sum(0) if matrices else None
 
     def spring_force(self, q: Tensor) -> Tensor:
@@ -348,15 +339,6 @@ class KnownMechanics(LearnedConstants):
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
         bias = bias + self.spring_force(q) - self.constant_force()
         return mass + torch.diag(self.rotor_inertia()), bias
-
-    def friction_force(self, v: Tensor) -> Tensor:
-        return self.friction(v)
-
-    def friction_slope(self, v: Tensor) -> Tensor:
-        return self.friction.slope(v)
-
-    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
-        return self.friction.sliding(v, share)
 
 
 def _driven_joints(

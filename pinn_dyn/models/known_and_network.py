@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import cast
 
 from pydantic import NonNegativeFloat
 from torch import Tensor
@@ -87,14 +88,11 @@ class KnownAndNetwork(Sum):
     @property
     def known(self) -> KnownMechanics:
         """Known part of the sum."""
-        part = self.parts["known"]
-        assert isinstance(part, KnownMechanics)
-        return part
+        return cast("KnownMechanics", self.parts["known"])
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return the penalty of the network's force and of the residual force."""
-        network = self.parts["network"]
-        assert isinstance(network, LagrangianNetwork)
+        network = cast("LagrangianNetwork", self.parts["network"])
         share = network.inverse_dynamics(q, v, a) / self.force
         penalty = self.weight * share.square().mean()
         return penalty if self.residual is None else penalty + self.residual.penalty(q, v, u)

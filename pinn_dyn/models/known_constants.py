@@ -26,23 +26,39 @@ class Named(NamedTuple):
 
 
 class Constants(nn.Module, abc.ABC):
-    """Constants of one kind, computed from the parameters ``z``.
+    """Constants of one kind as a function of the parameters ``z``, which may have any value.
+
+    In a least-squares fit, z has a standard normal prior.
 
     Attributes:
+        positive: true for numbers above ``lower``, and for positive definite matrices.
         names, units: meaning and unit of each entry of the flattened z.
         lower: lower limit of the constants.
+        scale_with_force: true if a common factor of all masses and forces multiplies the constants,
+            one value or one per entry of the flattened z.
     """
 
+    positive: bool = False
     lower: float = -math.inf
+    scale_with_force: Tensor | bool
 
     def __init__(self, start: Tensor, names: Sequence[str], units: Sequence[str]):
         super().__init__()
         self.z = nn.Parameter(start)
         self.names, self.units = list(names), list(units)
+        self.scale_with_force = torch.tensor(["N" in unit or "kg" in unit for unit in self.units])
 
     @abc.abstractmethod
+    def value_of(self, z: Tensor) -> Tensor:
+        """Return the constants in SI units for the parameters z, ``(*batch, ...)``."""
+
+    def parameters_of(self, values: Tensor) -> Tensor:
+        """Return z of constants ``(*batch, ...)``; NaN if they are beyond their limit."""
+        raise NotImplementedError(f"{type(self).__name__} has no inverse")
+
     def forward(self) -> Tensor:
         """Return the constants in SI units."""
+        return self.value_of(self.z)
 
     def named(self) -> Named:
         """Return the constants with their names and units."""
@@ -75,6 +91,7 @@ class PositiveConstants(Constants):
         floor: lower limit of the constants.
     """
 
+    positive = True
     start: Tensor
 
     def __init__(
@@ -92,9 +109,12 @@ class PositiveConstants(Constants):
         self.spread = spread
         self.lower = floor
 
-    def forward(self) -> Tensor:
-        values = self.start * torch.exp(self.spread * self.z)
+    def value_of(self, z: Tensor) -> Tensor:
+        values = self.start * torch.exp(self.spread * z)
         return values + self.lower if self.lower else values
+
+    def parameters_of(self, values: Tensor) -> Tensor:
+        return torch.log((values - self.lower) / self.start) / self.spread
 
 
 class SoftplusConstants(Constants):
@@ -122,8 +142,8 @@ class SoftplusConstants(Constants):
         self.register_buffer("scale", scale.float().clone())
         self.floor = floor
 
-    def forward(self) -> Tensor:
-        values = F.softplus(self.z)
+    def value_of(self, z: Tensor) -> Tensor:
+        values = F.softplus(z)
         return self.scale * (values + self.floor if self.floor else values)
 
 
@@ -136,8 +156,8 @@ class RealConstants(Constants):
         super().__init__(torch.zeros(spread.shape), names, units)
         self.register_buffer("spread", spread.float().clone())
 
-    def forward(self) -> Tensor:
-        return self.spread * self.z
+    def value_of(self, z: Tensor) -> Tensor:
+        return self.spread * z
 
 
 class PhysicalBodies(Constants):
@@ -160,6 +180,7 @@ class PhysicalBodies(Constants):
         bodies: n names.
     """
 
+    positive = True
     root: Tensor
     spread: Tensor
 
@@ -176,6 +197,7 @@ class PhysicalBodies(Constants):
         parts += ["x centre", "y centre", "z centre"]
         names = [f"{part} of {body}" for body in bodies for part in parts]
         super().__init__(torch.zeros(len(start), 10), names, ["1"] * len(names))
+        self.scale_with_force = True
         mass = start[:, 3, 3, None, None]
         centre = start[:, :3, 3:] / mass
         root = torch.zeros_like(start)
@@ -189,12 +211,8 @@ class PhysicalBodies(Constants):
         """Return J_start, ``(n, 4, 4)``."""
         return self.root @ self.root.mT
 
-    def forward(self) -> Tensor:
-        """Return J, ``(n, 4, 4)``, or ``(*batch, n, 4, 4)`` for z ``(*batch, n, 10)``."""
-        return self.inertia_of(self.z)
-
-    def inertia_of(self, z: Tensor) -> Tensor:
-        """Return J for the parameters z, with the shapes of :meth:`forward`."""
+    def value_of(self, z: Tensor) -> Tensor:
+        """Return J, ``(*batch, n, 4, 4)``, for z ``(*batch, n, 10)``."""
         a, d1, d2, d3, s12, s13, s23, t1, t2, t3 = (self.spread * z).unbind(-1)
         zero, unit = torch.zeros_like(a), torch.ones_like(a)
         rows = [
@@ -207,9 +225,9 @@ class PhysicalBodies(Constants):
         root = torch.exp(a)[..., None, None] * (self.root @ stretch)
         return root @ root.mT
 
-    def parameters_of(self, inertia: Tensor) -> Tensor:
+    def parameters_of(self, values: Tensor) -> Tensor:
         """Return z of pseudo-inertias, ``(*batch, n, 10)``; NaN without a positive density."""
-        whitened = torch.linalg.solve(self.root, torch.linalg.solve(self.root, inertia).mT)
+        whitened = torch.linalg.solve(self.root, torch.linalg.solve(self.root, values).mT)
         # Reversed rows and columns turn the lower Cholesky factor into an upper factor.
         factor, failed = torch.linalg.cholesky_ex(whitened.flip(-2, -1))
         stretch = torch.where(failed[..., None, None] == 0, factor, torch.nan).flip(-2, -1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,8 +9,6 @@ from torch import Tensor
 from torch.func import functional_call
 
 from pinn_dyn.models.learned_constants import Called, LearnedConstants, Samples, Slopes
-
-_BODIES = "model.bodies.z"
 
 
 class KnownSlopes(Slopes):
@@ -24,21 +21,43 @@ class KnownSlopes(Slopes):
     the second term.
     """
 
-    def __init__(self, model: LearnedConstants):
-        super().__init__(model)
-        self._bodies = self._body_slopes()
-
     def by_parameters(self, *at: Tensor) -> Tensor:
         return self.by_regressor(self.model.structure.regressor(*at[:3]), *at)
 
     def by_regressor(self, regressor: Tensor, *at: Tensor) -> Tensor:
+        """Return de/dz, ``(*batch, N, P)``, with Y at the samples, ``(*batch, N, 10 n)``."""
+        model, z = self.model, self.model.bodies.z.detach()
+        copies = z.expand(10, *z.shape).clone().requires_grad_()  # one for each parameter pi
+
         def elements(m: Any) -> Tensor:
             """Return the forces of all drives, followed by all springs, ``(*batch, N + S)``."""
-            force = m.drive_force(*at)
-            return force if m.elastic is None else torch.cat([force, m.elastic.forces(*at[:2])], -1)
+            springs = (part.forces(*at[:2]) for part in m.all_springs())
+            return torch.cat([m.drive_force(*at), *springs], dim=-1)
 
-        drives = self._drive_slopes(elements, at[0])
-        return torch.cat([regressor @ self._bodies, drives], dim=-1)
+        called = Called(model, elements)
+        values = {
+            name: z.detach().expand(*at[0].shape[:-1], -1).clone().requires_grad_()
+            for name, z in called.named_parameters()
+            if name != "model.bodies.z"
+        }
+        with torch.enable_grad():
+            table = model.structure.parameters_of(model.bodies.value_of(copies))
+            (bodies,) = torch.autograd.grad(table.diagonal(dim1=0, dim2=-1).sum(), copies)
+            total = functional_call(called, values, ()).sum()
+            slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
+        # Constants of drives have an entry per driven joint, not per joint.
+        sides = dict.fromkeys(("armature", "drives"), model.drives.selection)
+        sides["offset"] = model.offset_joints
+        for name in ("springs", "elastic"):
+            if (springs := getattr(model, name)) is not None:
+                sides[name] = springs.stretch
+        blocks = [regressor @ torch.block_diag(*bodies.movedim(0, 1))]
+        for name, slope in zip(values, slopes, strict=True):
+            side = sides.get(name.split(".")[1])
+            blocks.append(
+                torch.diag_embed(slope) if side is None else side.mT * slope[..., None, :]
+            )
+        return torch.cat(blocks, dim=-1)
 
     def by_state(self, *at: Tensor) -> Tensor:
         q, v, a, *inputs = at
@@ -48,54 +67,10 @@ class KnownSlopes(Slopes):
             force = self.model.drive_force(*state, a, *inputs).sum()
             drives = torch.autograd.grad(force, state, materialize_grads=True)
         by_q, by_v = (x + torch.diag_embed(y) for x, y in zip((by_q, by_v), drives, strict=True))
-        if self.model.elastic is not None:
-            stiffness, damping = self.model.elastic.matrices()
+        for springs in self.model.all_springs():
+            stiffness, damping = springs.matrices()
             by_q, by_v = by_q + stiffness, by_v + damping
         return torch.cat([by_q, by_v], dim=-1)
-
-    def gain(self) -> Tensor:
-        gain = self.model.viscous()
-        # The zero term keeps the sum differentiable if the gain is not learned.
-        drives = self._drive_slopes(lambda m: m.drive_gain() + 0 * m.viscous(), gain)
-        return torch.cat([gain.new_zeros(len(gain), len(self._bodies)), drives], dim=-1)
-
-    def _body_slopes(self) -> Tensor:
-        z = self.model.bodies.z.detach()
-        copies = z.expand(10, *z.shape).clone().requires_grad_()
-        with torch.enable_grad():
-            called = Called(self.model, lambda m: m.body_parameters())
-            table = functional_call(called, {_BODIES: copies}, ())
-            (slopes,) = torch.autograd.grad(table.diagonal(dim1=0, dim2=-1).sum(), copies)
-        return torch.block_diag(*slopes.movedim(0, 1))
-
-    def _drive_slopes(self, function: Callable[[Any], Tensor], like: Tensor) -> Tensor:
-        """Return d function_i / dz, ``(*batch, N, P - 10 n)``, without parameters of the n bodies.
-
-        The function of the model returns a tensor with the shape of ``like``.
-        """
-        called = Called(self.model, function)
-        values = {
-            name: z.detach().expand(*like.shape[:-1], -1).clone().requires_grad_()
-            for name, z in called.named_parameters()
-            if name != _BODIES
-        }
-        with torch.enable_grad():
-            total = functional_call(called, values, ()).sum()
-            slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
-        # Constants of drives have an entry per driven joint, not per joint.
-        sides = dict.fromkeys(("armature", "drives"), self.model.motors)
-        sides["offset"] = self.model.offset_joints
-        if self.model.springs is not None:
-            sides["springs"] = self.model.springs.selection
-        if self.model.elastic is not None:
-            sides["elastic"] = self.model.elastic.stretch
-        blocks = []
-        for name, slope in zip(values, slopes, strict=True):
-            side = sides.get(name.split(".")[1])
-            blocks.append(
-                torch.diag_embed(slope) if side is None else side.mT * slope[..., None, :]
-            )
-        return torch.cat(blocks, dim=-1)
 
 
 class KnownSamples(Samples):
@@ -108,8 +83,8 @@ class KnownSamples(Samples):
     def missing_force(self) -> Tensor:
         bodies = self._regressor @ self.model.body_parameters().flatten()
         force = bodies + self.model.drive_force(*self.at)
-        if self.model.elastic is not None:
-            force = force + self.model.elastic.forces(*self.at[:2]) @ self.model.elastic.stretch
+        for springs in self.model.all_springs():
+            force = force + springs.forces(*self.at[:2]) @ springs.stretch
         return force
 
     def by_parameters(self) -> Tensor:

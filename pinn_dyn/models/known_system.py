@@ -25,7 +25,8 @@ def _of_structure(name: str) -> Callable[..., Any]:
     """Build a method that calls the structure with the learned constants in its buffers."""
 
     def method(self: KnownSystem, *values: Tensor) -> Any:
-        learned = {f"model.{key}": part().view(self.shapes[key]) for key, part in self.parts()}
+        parts = self.learned.items()
+        learned = {f"model.{key}": part().view(self.shapes[key]) for key, part in parts}
         return functional_call(self.structure, learned, (name, *values))
 
     return method
@@ -76,10 +77,6 @@ class KnownSystem(LearnedConstants):
             self.shapes[name] = start.shape
         self.structure = Called(copy.deepcopy(structure), _term)
 
-    def parts(self) -> list[tuple[str, PositiveConstants]]:
-        """Return the constants by their names in the structure."""
-        return list(self.learned.items())  # type: ignore[arg-type]
-
     mass_matrix = _of_structure("mass_matrix")
     potential_energy = _of_structure("potential_energy")
     damping_matrix = _of_structure("damping_matrix")
@@ -95,10 +92,6 @@ class KnownSystem(LearnedConstants):
     input_force = _of_structure("input_force")
     _residual_force = _of_structure("_residual_force")
     applied_force = _of_structure("applied_force")
-    _hamiltonian_gradient = _of_structure("_hamiltonian_gradient")
-    _momentum = _of_structure("_momentum")
-    _velocity = _of_structure("_velocity")
-    _kinetic_gradient = _of_structure("_kinetic_gradient")
 
 
 def _units_of(structure: MechanicalSystem) -> dict[str, list[str]]:

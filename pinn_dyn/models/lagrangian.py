@@ -86,15 +86,8 @@ class LagrangianNetwork(structured.StructuredNetwork):
         factor, bias = self._factor_and_coriolis_force(q, v)
         return self._solve(factor, force - bias - self._potential_force(q))
 
-    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
-        return self.mass.product(q, v)
-
     def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
         return self._solve(self.mass(q), p)
-
-    def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
-        factor, tape = self.mass.linearize(q)
-        return self._energy_gradient(tape, v, matvec(self._root(factor), v))
 
     def _factor_and_coriolis_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Return L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq with M = R^T R, dR along v."""

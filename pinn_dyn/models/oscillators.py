@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -47,18 +47,6 @@ def _slopes(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """Return dy/dx ``(*batch, n, m)`` of y = f(x) ``(*batch, n)``, row by row."""
     rows = torch.func.vmap(torch.func.jacrev(function))(x.reshape(-1, x.shape[-1]))
     return rows.reshape(*x.shape[:-1], *rows.shape[1:])
-
-
-def _refuse_force_without_changes(
-    force: LinearAndMLP, state: dict[str, Tensor], prefix: str, *_: Any
-) -> None:
-    """Refuse the weights of a force of u alone, which earlier versions had."""
-    weight = state.get(f"{prefix}first.weight")
-    if weight is not None and weight.shape != force.first.weight.shape:
-        raise ValueError(
-            "the force of these oscillators is of an earlier form, without the change of the "
-            "inputs over a step: train the model again"
-        )
 
 
 class CoupledOscillators(EncodedPredictor):
@@ -122,7 +110,6 @@ class CoupledOscillators(EncodedPredictor):
         frequency = torch.linspace(math.log(_SLOWEST), math.log(_FASTEST), n)
         mixed = _SPREAD * torch.randn(2, n, n) / n**0.5
         self.force = LinearAndMLP(2 * inputs, n, self._force_hidden, activation)
-        self.force.register_load_state_dict_pre_hook(_refuse_force_without_changes)
         self.stiffness = nn.Parameter(torch.diag(frequency) + mixed[0].tril(-1))
         damping = (frequency + math.log(2 * _DAMPING)) / 2
         self.damping = nn.Parameter(torch.diag(damping) + mixed[1].tril(-1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -11,38 +11,29 @@ from pinn_dyn.models.known_constants import Constants, PositiveConstants, Softpl
 from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.statistics import Statistics
 
+_UNITS = {
+    "ratio": ("1", "1"),
+    "position": ("m", "rad"),
+    "speed": ("m/s", "rad/s"),
+    "force": ("N", "Nm"),
+    "gain": ("N/u", "Nm/u"),
+    "inertia": ("kg", "kg m^2"),
+    "stiffness": ("N/m", "Nm/rad"),
+    "damping": ("Ns/m", "Nms/rad"),
+}
+"""Units of the quantities of a sliding and of a turning joint."""
+
 
 @dataclass(frozen=True)
 class Joint:
-    """Name of a joint, and units of its quantities for a turning or sliding joint."""
+    """Name of a joint, and whether it turns or slides."""
 
     name: str
     turns: bool = True
 
-    @property
-    def force(self) -> str:
-        """Unit of a torque or force."""
-        return "Nm" if self.turns else "N"
-
-    @property
-    def speed(self) -> str:
-        """Unit of the velocity."""
-        return "rad/s" if self.turns else "m/s"
-
-    @property
-    def inertia(self) -> str:
-        """Unit of an armature."""
-        return "kg m^2" if self.turns else "kg"
-
-    @property
-    def stiffness(self) -> str:
-        """Unit of a stiffness."""
-        return "Nm/rad" if self.turns else "N/m"
-
-    @property
-    def damping(self) -> str:
-        """Unit of viscous friction."""
-        return "Nms/rad" if self.turns else "Ns/m"
+    def unit(self, quantity: str) -> str:
+        """Return the unit of a quantity, such as ``"force"`` or ``"inertia"``."""
+        return _UNITS[quantity][self.turns]
 
 
 @dataclass(frozen=True)
@@ -80,13 +71,17 @@ class Scales:
         """Number of inputs M."""
         return self.statistics.num_inputs
 
+    def restricted(self, index: Sequence[int]) -> Scales:
+        """Return the same scales for constants of some of the joints."""
+        return replace(self, named=tuple(self.joints[k] for k in index))
+
     def positive(
         self,
         label: str,
         ratio: float,
         scale: Tensor,
         spread: float,
-        units: Sequence[str],
+        quantity: str,
         floor: float = 0.0,
     ) -> Constants:
         """Build learned positive constants, one per joint, named "<label> of <joint>".
@@ -96,10 +91,11 @@ class Scales:
             ratio: initial value in units of the scale.
             scale: typical size, ``(N,)``.
             spread: prior standard deviation of the logarithm.
-            units: N units.
+            quantity: quantity whose unit the constants have, see :meth:`Joint.unit`.
             floor: lower limit in units of the scale, or of the mean scale if ``prior`` is true.
         """
         names = [f"{label} of {joint.name}" for joint in self.joints]
+        units = [joint.unit(quantity) for joint in self.joints]
         if self.prior:
             scale = scale.double()
             lower = floor * float(scale.mean())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -89,19 +88,17 @@ class Servo(Drives):
             start = torch.as_tensor(stiffness, dtype=torch.float64).expand(len(index)).clone()
             force = force.index_copy(0, torch.tensor(index), start * spread_of_q / _START)
         self._force, force = force, force[index]
-        motors = replace(scales, named=tuple(scales.joints[k] for k in index))
-        units = [joint.stiffness for joint in motors.joints]
-        build = partial(motors.positive, spread=spread or 1.5)
-        self.stiffness = build("servo stiffness", 1.0, start, units=units) if spread > 0 else None
+        build = partial(scales.restricted(index).positive, spread=spread or 1.5)
+        self.stiffness = None
+        if spread > 0:
+            self.stiffness = build("servo stiffness", 1.0, start, quantity="stiffness")
         self.damping = self.limit = None
         self.affine = self.identified_by_forces = limit is None
         if not self.affine:
-            units = [joint.damping for joint in motors.joints]
             rate = force / data.v_std[index]
-            self.damping = build("servo damping", 0.1, rate, units=units)
+            self.damping = build("servo damping", 0.1, rate, quantity="damping")
         if limit == "learned":
-            units = [joint.force for joint in motors.joints]
-            self.limit, limit = build("servo limit", 1.0, force, units=units), None
+            self.limit, limit = build("servo limit", 1.0, force, quantity="force"), None
         unlimited = torch.finfo(torch.float32).max  # a checkpoint has no infinite numbers
         largest = torch.as_tensor(limit or unlimited, dtype=torch.float32)
         self.register_buffer("error", (spread_of_q / _START).float(), persistent=False)
@@ -141,21 +138,6 @@ class Servo(Drives):
 
     def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         return self._limited(self._linear_torque(q, v, u)) @ self.selection
-
-    def spring_energy(self, q: Tensor) -> Tensor:
-        return 0.5 * (self.springs() * q * q).sum(-1)
-
-    def spring_force(self, q: Tensor) -> Tensor:
-        return self.springs() * q
-
-    def stiffness_matrix(self) -> Tensor:
-        return torch.diag(self.springs())
-
-    def damping_matrix(self) -> Tensor:
-        return torch.diag(self.damping_rates())
-
-    def damping_force(self, v: Tensor) -> Tensor:
-        return self.damping_rates() * v
 
     def applied(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         force = self.force(q, u)

@@ -9,8 +9,14 @@ from pydantic import PositiveFloat
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from pinn_dyn.models.known_constants import Constants, Named, PositiveConstants, RealConstants
-from pinn_dyn.models.scales import Scales
+from pinn_dyn.models.known_constants import (
+    Constants,
+    HasConstants,
+    Named,
+    PositiveConstants,
+    RealConstants,
+)
+from pinn_dyn.models.scales import Joint, Scales
 from pinn_dyn.models.structure import Structure
 
 _START = 0.3  # initial k in units of the typical force over the spread of q
@@ -18,7 +24,49 @@ _SPREAD = 2.0  # prior standard deviation of the logarithms
 _PRELOAD = 3.0  # prior standard deviation of p in typical forces, as springs may carry the weight
 
 
-class JointSprings(nn.Module):
+class Springs(HasConstants):
+    """Linear springs with the stretches s = B q ``(S,)``, and the force B^T f on the coordinates::
+
+        f = K s + D ds/dt - p
+
+    K is in Nm/rad or N/m, D in Nms/rad or Ns/m and p in Nm or N, ``(S,)`` each.
+
+    Args:
+        stretch: B, ``(S, N)``.
+        stiffness, damping, preload: learned K, D and p; None for zero.
+    """
+
+    stretch: Tensor
+
+    def __init__(
+        self,
+        stretch: Tensor,
+        stiffness: Constants,
+        *,
+        damping: Constants | None = None,
+        preload: Constants | None = None,
+    ):
+        super().__init__()
+        self.register_buffer("stretch", stretch.clone(), persistent=False)
+        self.stiffness, self.damping, self.preload = stiffness, damping, preload
+
+    def forces(self, q: Tensor, v: Tensor) -> Tensor:
+        """Return f, ``(*batch, S)``."""
+        force = self.stiffness() * (q @ self.stretch.mT)
+        if self.damping is not None:
+            force = force + self.damping() * (v @ self.stretch.mT)
+        return force if self.preload is None else force - self.preload()
+
+    def matrices(self) -> tuple[Tensor, Tensor]:
+        """Return stiffness and damping of the coordinates, ``(N, N)``."""
+        side = self.stretch.mT
+        stiffness = (side * self.stiffness()) @ side.mT
+        if self.damping is None:
+            return stiffness, torch.zeros_like(stiffness)
+        return stiffness, (side * self.damping()) @ side.mT
+
+
+class JointSprings(Springs):
     """Linear springs at S of N joints, with the potential V and the force dV/dq::
 
         V = sum over j of k_j (q_j - r_j)^2 / 2,    dV/dq_j = k_j q_j - p_j,    p_j = k_j r_j
@@ -28,42 +76,36 @@ class JointSprings(nn.Module):
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
-        joints: coordinates with a spring.
+        index: coordinates with a spring.
     """
 
-    selection: Tensor
+    preload: RealConstants
 
-    def __init__(self, scales: Scales, joints: Sequence[int]):
-        super().__init__()
-        index, force = list(joints), scales.value.double()
-        named = [scales.joints[k] for k in index]
-        units = [joint.stiffness for joint in named]
-        start = force / scales.statistics.q_std.double()
-        part = Scales(scales.statistics, start, named=tuple(named), prior=True)
-        self.stiffness = part.positive("spring stiffness", _START, start[index], _SPREAD, units)
+    def __init__(self, scales: Scales, index: Sequence[int]):
+        part, force = scales.restricted(index), scales.value.double()[list(index)]
+        start = force / scales.statistics.q_std.double()[list(index)]
         kinds = {True: "rest angle", False: "rest position"}
-        names = [f"{kinds[joint.turns]} of {joint.name}" for joint in named]
-        self.preload = RealConstants(_PRELOAD * force[index], names, [x.force for x in named])
-        self.register_buffer("selection", torch.eye(scales.size)[index], persistent=False)
-
-    def springs(self) -> Tensor:
-        """Return k of all coordinates, ``(N,)``; 0 for a joint without a spring."""
-        return self.stiffness() @ self.selection
+        names = [f"{kinds[joint.turns]} of {joint.name}" for joint in part.joints]
+        forces = [joint.unit("force") for joint in part.joints]
+        super().__init__(
+            torch.eye(scales.size)[list(index)],
+            part.positive("spring stiffness", _START, start, _SPREAD, "stiffness"),
+            preload=RealConstants(_PRELOAD * force, names, forces),
+        )
+        self._units = [joint.unit("position") for joint in part.joints]
 
     def constant_force(self) -> Tensor:
         """Return p of all coordinates, ``(N,)``."""
-        return self.preload() @ self.selection
+        return self.preload() @ self.stretch
 
     def rest_positions(self) -> Tensor:
-        """Return r of all coordinates, ``(N,)``; 0 for a joint without a spring."""
-        return (self.preload() / self.stiffness()) @ self.selection
+        """Return r, ``(S,)``."""
+        return self.preload() / self.stiffness()
 
     def physical_constants(self) -> list[Named]:
         """Return k and r."""
-        positions = self.preload() / self.stiffness()
-        units = ["rad" if unit == "Nm" else "m" for unit in self.preload.units]
-        rest_positions = self.preload.named()._replace(values=positions, units=units)
-        return [self.stiffness.named(), rest_positions]
+        rest = self.preload.named()._replace(values=self.rest_positions(), units=self._units)
+        return [self.stiffness.named(), rest]
 
 
 _RATE = 1e-3  # ratio of initial damping to stiffness, s
@@ -159,32 +201,19 @@ class ElasticJoints(nn.Module):
     def _matrix(self, x: Tensor) -> Tensor:
         return self._vector(self._vector(x).mT).mT
 
+    def springs(self) -> Springs:
+        """Build the springs between links and motors, with learned K and D."""
+        names, turning = self.joint_names[self.size :], self.turning[self.size :]
+        joints = [
+            Joint(name.removesuffix("_motor"), turns)
+            for name, turns in zip(names, turning, strict=True)
+        ]
+        start = torch.full((len(joints),), float(self.stiffness)).double()
 
-class Springs(nn.Module):
-    """Learned K and D of elastic joints, ``(S,)``. A stretch s has the force K s + D ds/dt."""
+        def constants(quantity: str, start: Tensor) -> Constants:
+            labels = [f"joint {quantity} of {joint.name}" for joint in joints]
+            units = [joint.unit(quantity) for joint in joints]
+            return PositiveConstants(start, _SPREAD, labels, units)
 
-    stretch: Tensor
-
-    def __init__(self, structure: ElasticJoints):
-        super().__init__()
-        self.register_buffer("stretch", structure.stretch.clone(), persistent=False)
-        joints = [name.removesuffix("_motor") for name in structure.joint_names[structure.size :]]
-        turning = structure.turning[structure.size :]
-        start = torch.full((len(joints),), float(structure.stiffness)).double()
-
-        def constants(label: str, start: Tensor, units: tuple[str, str]) -> Constants:
-            names = [f"{label} of {joint}" for joint in joints]
-            return PositiveConstants(start, _SPREAD, names, [units[not x] for x in turning])
-
-        self.stiffness = constants("joint stiffness", start, ("Nm/rad", "N/m"))
-        self.damping = constants("joint damping", _RATE * start, ("Nms/rad", "Ns/m"))
-
-    def forces(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return the force of each spring, ``(*batch, S)``."""
-        stretch = self.stretch.mT
-        return self.stiffness() * (q @ stretch) + self.damping() * (v @ stretch)
-
-    def matrices(self) -> tuple[Tensor, Tensor]:
-        """Return stiffness and damping of the coordinates (q, theta), ``(N + S, N + S)``."""
-        side = self.stretch.mT
-        return (side * self.stiffness()) @ side.mT, (side * self.damping()) @ side.mT
+        damping = constants("damping", _RATE * start)
+        return Springs(self.stretch, constants("stiffness", start), damping=damping)

@@ -22,16 +22,33 @@ class Structure(Protocol):
     body_joints: list[int]
     inertia: Tensor
 
-    def generic_inertia(self) -> Tensor: ...
-    def prior_inertia(self) -> Tensor: ...
-    def parameters_of(self, inertia: Tensor) -> Tensor: ...
-    def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor: ...
-    def potential_energy(self, q: Tensor, inertia: Tensor) -> Tensor: ...
-    def mass_and_bias(self, q: Tensor, v: Tensor, inertia: Tensor) -> tuple[Tensor, Tensor]: ...
+    def generic_inertia(self) -> Tensor:
+        """Return the pseudo-inertias of rods along the links, ``(n, 4, 4)``."""
+
+    def prior_inertia(self) -> Tensor:
+        """Return the pseudo-inertias of the description, or of a rod for an impossible body."""
+
+    def parameters_of(self, inertia: Tensor) -> Tensor:
+        """Return the inertial parameters pi of pseudo-inertias, ``(n, 10)``."""
+
+    def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor:
+        """Return M(q), ``(*batch, N, N)``."""
+
+    def potential_energy(self, q: Tensor, inertia: Tensor) -> Tensor:
+        """Return V(q), ``(*batch,)``, J."""
+
+    def mass_and_bias(self, q: Tensor, v: Tensor, inertia: Tensor) -> tuple[Tensor, Tensor]:
+        """Return M(q) and C(q, v) v + G(q)."""
+
     def rigid_force(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor, gravity: bool
-    ) -> Tensor: ...
-    def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor: ...
+    ) -> Tensor:
+        """Return M(q) a + C(q, v) v, and with ``gravity`` also + G(q), ``(*batch, N)``."""
+
+    def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """Return Y with M a + C v + G = Y pi, ``(*batch, N, 10 n)``."""
+
     def force_slopes(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor
-    ) -> tuple[Tensor, Tensor]: ...
+    ) -> tuple[Tensor, Tensor]:
+        """Return the derivatives of M a + C v + G by q and by v, ``(*batch, N, N)`` each."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, MechanicalSystem, State
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky, Positive
-from pinn_dyn.models.friction import Friction
+from pinn_dyn.models.friction import Friction, HasFriction
 from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput, NoInput
 from pinn_dyn.models.potential import NetworkPotential, Potential
 from pinn_dyn.models.residual import ResidualHead
@@ -30,7 +31,7 @@ INPUT = partial(NetworkInput, hidden=(16, 16))
 """Default heads, those of the options named ``network`` in conf/model."""
 
 
-class StructuredNetwork(MechanicalSystem):
+class StructuredNetwork(HasFriction, MechanicalSystem):
     """Mechanical system with learned V, D, F, A and residual force. Subclasses add the mass.
 
     The scales of the heads come from the data: A ~ f/u with the root mean square f of the input,
@@ -77,16 +78,20 @@ class StructuredNetwork(MechanicalSystem):
         return Scales(statistics, value, self.angles)
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        return self.potential(q) + self.input.spring_energy(q)
+        springs, energy = self.input.springs(), self.potential(q)
+        return energy if springs is None else energy + 0.5 * (springs * q * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        return self.damping.matrix(q) + self.input.damping_matrix()
+        rates, matrix = self.input.damping_rates(), self.damping.matrix(q)
+        return matrix if rates is None else matrix + torch.diag(rates)
 
     def damping_force(self, q: Tensor, v: Tensor) -> Tensor:
-        return self.damping.product(q, v) + self.input.damping_force(v)
+        rates, force = self.input.damping_rates(), self.damping.product(q, v)
+        return force if rates is None else force + rates * v
 
     def stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        return self.input.stiffness_matrix()
+        springs = self.input.springs()
+        return None if springs is None else torch.diag(springs)
 
     def applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         force = self.input.applied(q, v, u)
@@ -98,15 +103,6 @@ class StructuredNetwork(MechanicalSystem):
     def typical_input(self, q: Tensor) -> Tensor:
         return self.input.typical_input(q)
 
-    def friction_force(self, v: Tensor) -> Tensor:
-        return self.friction(v)
-
-    def friction_slope(self, v: Tensor) -> Tensor:
-        return self.friction.slope(v)
-
-    def sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
-        return self.friction.sliding(v, share)
-
     def input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.input.force(q, u)
 
@@ -117,4 +113,5 @@ class StructuredNetwork(MechanicalSystem):
         return v.new_zeros(()) if self.residual is None else self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:
-        return self.potential.gradient(q) + self.input.spring_force(q)
+        springs, force = self.input.springs(), self.potential.gradient(q)
+        return force if springs is None else force + springs * q

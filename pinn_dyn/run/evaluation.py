@@ -10,7 +10,6 @@ from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.data import DataSource, LogSource, Splits, data_changes, data_identity
 from pinn_dyn.data.bandwidth import too_long_for
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
@@ -156,7 +155,7 @@ def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
     for suffixes in (seeds, [f" {run.folder.name}" for run in runs]):
         if len(set(names)) < len(names):
             parts = zip(names, suffixes, runs, strict=True)
-            names = [x if isinstance(run.model, Ensemble) else x + y for x, y, run in parts]
+            names = [x if len(run.members) > 1 else x + y for x, y, run in parts]
     return names
 
 

@@ -155,13 +155,17 @@ def _export_robot(model: Predictor, path: Path) -> Path:
     chain = chain.double()
     with torch.no_grad():
         drives, offset = model.drives, model.offset() @ model.offset_joints
-        stiffness, rest = 2 * [0 * offset]
+        stiffness = rest = zero = torch.zeros_like(offset)
         if model.springs is not None:
-            stiffness, rest = model.springs.springs(), model.springs.rest_positions()
+            side = model.springs.stretch
+            stiffness = model.springs.stiffness() @ side
+            rest = model.springs.rest_positions() @ side
         limit = torch.full_like(offset, torch.inf)
         if not drives.affine:
             limit[model.driven] = drives.largest_force()
-        springs, damping = drives.springs(), drives.damping_rates()
+        springs, damping = (
+            zero if x is None else x for x in (drives.springs(), drives.damping_rates())
+        )
         constants_of_drives = model.physical_constants()[_BODY_COLUMNS:]
         fast = torch.full_like(model.viscous(), torch.inf)
         constants = RobotConstants(
@@ -169,7 +173,7 @@ def _export_robot(model: Predictor, path: Path) -> Path:
             armature=model.rotor_inertia(),
             damping=model.viscous(),
             friction=(model.friction(fast) - model.friction(-fast)) / 2,
-            gain=springs if drives.takes_targets else drives.strength() @ model.motors,
+            gain=springs if drives.takes_targets else drives.strength() @ drives.selection,
             bias=torch.stack([offset, -springs, -damping], dim=-1),
             limit=limit,
             stiffness=stiffness,

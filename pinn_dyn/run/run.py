@@ -95,7 +95,8 @@ class Run:
 
     def __repr__(self) -> str:
         name, data = self.config["model_name"], self.config["dataset"].get("name")
-        members = f"{len(self.model.members)} members, " if isinstance(self.model, Ensemble) else ""
+        count = len(self.model.members)
+        members = f"{count} members, " if count > 1 else ""
         return (
             f"Run({name} of {data}: {members}q = ({', '.join(self.labels)}), "
             f"u = ({', '.join(self.input_labels)}), validation error {score(self.metrics)})"
@@ -145,15 +146,13 @@ class Run:
     @property
     def members(self) -> list[Run]:
         """The members of an ensemble as single models; a single model is its only member."""
-        if not isinstance(self.model, Ensemble):
-            return [self]
-        members: Any = self.model.members
-        return [replace(self, model=member) for member in members]
+        members = self.model.members
+        return [self] if len(members) == 1 else [replace(self, model=x) for x in members]
 
     @property
-    def ensemble(self) -> Ensemble | None:
+    def ensemble(self) -> Predictor | None:
         """The members of an ensemble, or draws of the constants that least squares fitted."""
-        if isinstance(self.model, Ensemble):
+        if len(self.model.members) > 1:
             return self.model
         return None if self.covariance is None else posterior_draws(self.model, self.covariance)
 
@@ -381,7 +380,7 @@ class Run:
         return (mean - reach).numpy(), (mean + reach).numpy()
 
     def _corrected_width(
-        self, ensemble: Ensemble, duration: float, level: float
+        self, ensemble: Predictor, duration: float, level: float
     ) -> tuple[Tensor, float]:
         """Return the floors of x ``(2N,)`` and c of :func:`.corrected_width`."""
         motions = stack_until(self.source.load().validation)
@@ -441,7 +440,7 @@ class Run:
     def system(self) -> MechanicalSystem:
         """The model as a mechanical system; TypeError for black boxes and ensembles."""
         if not isinstance(self.model, MechanicalSystem):
-            kind = "an ensemble" if isinstance(self.model, Ensemble) else "a black box"
+            kind = "an ensemble" if len(self.model.members) > 1 else "a black box"
             raise TypeError(f"the model is {kind} and has no terms M, D, G and A")
         labels = self.labels, self.input_labels
         if (self.model.labels, self.model.input_labels) != labels:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import scipy
 import torch
@@ -12,18 +11,9 @@ from torch import Tensor
 from pinn_dyn.mechanics import Trajectory
 
 
-class FilteredMotion(NamedTuple):
-    """Samples of filtered motion, ``(K, N)`` each."""
-
-    q: Tensor
-    v: Tensor
-    a: Tensor
-    u: Tensor
-
-
 def filtered_motion(
     trajectories: Sequence[Trajectory], cutoff: float, samples: int
-) -> FilteredMotion:
+) -> list[Tensor]:
     """Return at most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
 
     The Butterworth filter of fourth order runs forwards and backwards. a is the derivative of the
@@ -32,7 +22,7 @@ def filtered_motion(
     Raises:
         ValueError: if the cutoff is above half the sample rate, or all trajectories are too short.
     """
-    parts: list[FilteredMotion] = []
+    parts: list[list[Tensor]] = []
     for item in trajectories:
         rate = 1 / float(item.t[1] - item.t[0])
         if not cutoff < rate / 2:
@@ -52,13 +42,14 @@ def filtered_motion(
         near, far = v.roll(-1, 0) - v.roll(1, 0), v.roll(-2, 0) - v.roll(2, 0)
         a = (8 * near - far) * rate / 12
         edge = max(int(0.5 * rate / cutoff), 2)
-        parts.append(FilteredMotion(*(x[edge:-edge] for x in (q, v, a, u))))
+        parts.append([x[edge:-edge] for x in (q, v, a, u)])
     if not parts:
         longest = max(item.duration for item in trajectories)
         raise ValueError(
             f"least squares: the longest training trajectory has {longest:g} s, expected at least "
             f"three periods of the cutoff of {cutoff} Hz"
         )
-    joined = FilteredMotion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-    index = torch.linspace(0, len(joined.q) - 1, min(samples, len(joined.q))).long()
-    return FilteredMotion(*(x[index] for x in joined))
+    joined = [torch.cat(columns) for columns in zip(*parts, strict=True)]
+    count = len(joined[0])
+    index = torch.linspace(0, count - 1, min(samples, count)).long()
+    return [x[index] for x in joined]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from pinn_dyn.data.windows import Windows
@@ -49,7 +48,6 @@ class Compiled:
         self.loss, self.model, self.vector, self.steps = loss, model, vector, steps
         self._integrator = CompiledDynamics(model.integrator, model)
         self._program = LossProgram(loss, model, vector)
-        self.evaluations = EvaluationCount(loss, model)
 
     def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], list[Tensor]] | None:
         """Return a function that takes a step on a batch, or None if a program does not pay off."""
@@ -70,7 +68,8 @@ class Compiled:
 
     def _part(self, windows: Windows) -> int | None:
         """Return the windows that a program computes at once, or None without a program."""
-        evaluations, on_cpu = self.evaluations(windows), windows.q.device.type == "cpu"
+        evaluations = self.loss.evaluations(self.model, len(windows.t) - 1)
+        on_cpu = windows.q.device.type == "cpu"
         # On a GPU a program replaces thousands of launches.
         long = not on_cpu or self.steps >= STEPS_FOR_PROGRAM
         if evaluations == 0:  # of a rollout with joints that stick, which has no derivative
@@ -79,44 +78,9 @@ class Compiled:
             return None
         return CHUNK * MOST_EVALUATIONS // evaluations if on_cpu else len(windows)
 
-    def _loss(self, windows: Windows) -> Tensor:
-        with integrated_by(self.model, self._integrator):
-            laid_out = StateWindows.of(windows, self.model.state)
-            laid_out.x0.requires_grad_()  # so that all stages share a compiled function
-            return self.loss(self.model, laid_out)
-
     def _loss_and_gradient(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        loss = self._loss(windows)
+        laid_out = StateWindows.of(windows, self.model.state)
+        laid_out.x0.requires_grad_()  # so that all stages share a compiled function
+        with integrated_by(self.model, self._integrator):
+            loss = self.loss(self.model, laid_out)
         return loss.detach(), self.vector.gradient_of(loss)
-
-
-class EvaluationCount:
-    """Number of evaluations of the state derivative by the loss of a window, measured once."""
-
-    def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
-        self._loss, self._model = loss, model
-        self._counts: dict[int, int] = {}
-
-    def __call__(self, windows: Windows) -> int:
-        """Return the number of evaluations for windows of this length."""
-        steps = len(windows.t)
-        if steps not in self._counts:
-            sample = torch.arange(min(2, len(windows)), device=windows.q.device)
-            self._counts[steps] = self._count(windows[sample])
-        return self._counts[steps]
-
-    def _count(self, windows: Windows) -> int:
-        derivative, count = self._model.state_derivative, 0
-
-        def counted(x: Tensor, u: Tensor) -> Tensor:
-            nonlocal count
-            count += 1
-            return derivative(x, u)
-
-        self._model.state_derivative = counted  # type: ignore[method-assign]
-        try:
-            with torch.no_grad():
-                self._loss(self._model, windows)
-        finally:
-            del self._model.state_derivative
-        return count

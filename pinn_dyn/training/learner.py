@@ -106,12 +106,6 @@ class DynamicsLearner(L.LightningModule):
         self._losses: list[Tensor] = []  # losses of this epoch
         self._pace = math.inf  # time of a step, s
 
-    def _engine(self) -> Engine:
-        """Return the engine that computes loss and gradient."""
-        if self._compile and isinstance(self.model, ContinuousPredictor):
-            return Compiled(self.loss, self.model, self._vector, self._steps)
-        return Eager(self.loss, self.model, self._vector)
-
     def training_step(self, dataloader_iter: Iterator[tuple[Windows, int, int]]) -> None:
         """Take optimizer steps, one for each batch, until Lightning has something to do."""
         loop, trainer = self.trainer.fit_loop.epoch_loop, self.trainer
@@ -259,7 +253,9 @@ class DynamicsLearner(L.LightningModule):
             )
         self._steps = int(self.trainer.estimated_stepping_batches)
         self._vector = ParameterVector(self.model.parameters())
-        self._gradients = self._engine()
+        self._gradients: Engine = Eager(self.loss, self.model, self._vector)
+        if self._compile and isinstance(self.model, ContinuousPredictor):
+            self._gradients = Compiled(self.loss, self.model, self._vector, self._steps)
         optimizer = self._optimizer(self._vector.parameters)
         if type(optimizer) in ELEMENTWISE:  # which treat every number separately
             optimizer = self._optimizer([self._vector.values])

@@ -9,12 +9,13 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, State
-from pinn_dyn.mechanics.compilation import Unrolled, compile_graph, integrated_by
+from pinn_dyn.mechanics.compilation import compile_graph
+from pinn_dyn.models.learned_constants import Called
 from pinn_dyn.training.losses import WindowLoss
 from pinn_dyn.training.parameter_vector import MOVED, CompiledAdamW, ParameterVector
 
@@ -53,7 +54,7 @@ class LossProgram:
     """
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector):
-        self._loss = _Loss(loss, model)
+        self._loss, self._state = Called(model, lambda x, windows: loss(x, windows)), model.state
         self._names = [f"model.{name}" for name, _ in model.named_parameters()]
         self._vector = vector
         self._programs: dict[tuple[Any, ...], Program] = {}
@@ -88,7 +89,7 @@ class LossProgram:
         return call if self._alone else lambda: _pool(torch.get_num_threads()).submit(call).result()
 
     def _rows(self, windows: Windows) -> list[Tensor]:
-        rows = [getattr(windows, name) for name in _ROWS[self._loss.model.state]]
+        rows = [getattr(windows, name) for name in _ROWS[self._state]]
         rows += [windows.input.u] + ([] if windows.input.rate is None else [windows.input.rate])
         return [row.contiguous() for row in rows]
 
@@ -109,7 +110,7 @@ class LossProgram:
         return self._programs[key]
 
     def _traced(self, windows: Windows) -> Program:
-        state = self._loss.model.state
+        state = self._state
 
         def loss_and_gradient(vector: Tensor, *rows: Tensor) -> list[Tensor]:
             names = _ROWS[state]
@@ -129,24 +130,9 @@ class LossProgram:
 
 def weighted_sum(weights: list[float], parts: Iterable[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
     """Return the weighted sum of pairs (loss, gradient)."""
-    (loss, gradient), *terms = parts
-    if terms:
-        loss, gradient = weights[0] * loss, weights[0] * gradient
-    for weight, (part_loss, part_gradient) in zip(weights[1:], terms, strict=True):
-        loss.add_(part_loss, alpha=weight)
-        gradient.add_(part_gradient, alpha=weight)
-    return loss, gradient
-
-
-class _Loss(nn.Module):
-    def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
-        super().__init__()
-        self.model = model
-        self.loss = loss
-
-    def forward(self, windows: Windows) -> Tensor:
-        with integrated_by(self.model, Unrolled(self.model.integrator)):
-            return self.loss(self.model, windows)
+    losses, gradients = zip(*parts, strict=True)
+    shares = losses[0].new_tensor(weights)
+    return shares @ torch.stack(losses), shares @ torch.stack(gradients)
 
 
 def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:

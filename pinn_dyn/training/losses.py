@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor
+from pinn_dyn.mechanics.integrators import Sticking
 from pinn_dyn.models.statistics import Statistics
 
 __all__ = ["IncrementLoss", "MidpointLoss", "Penalized", "WindowLoss"]
@@ -31,6 +32,17 @@ class WindowLoss(nn.Module, abc.ABC):
         """Return the part of the windows that the loss uses at ``progress`` from 0 to 1."""
         return windows
 
+    def evaluations(self, model: ContinuousPredictor, steps: int) -> int:
+        """Return the number of evaluations of the state derivative in a window of ``steps`` steps.
+
+        The default is that of a rollout. It is 0 if joints stick, in which case other functions of
+        the model are called.
+        """
+        integrator = model.integrator
+        if isinstance(integrator, Sticking):
+            return 0
+        return steps * integrator.substeps * len(integrator.nodes)
+
 
 class Penalized(WindowLoss):
     """Sum of a loss and the penalty of the model (:meth:`Predictor.penalty`).
@@ -45,6 +57,9 @@ class Penalized(WindowLoss):
 
     def selected(self, windows: Windows, progress: float) -> Windows:
         return self.loss.selected(windows, progress)
+
+    def evaluations(self, model: ContinuousPredictor, steps: int) -> int:
+        return self.loss.evaluations(model, steps)
 
     def forward(self, model: Predictor, windows: Windows) -> Tensor:
         q, v = windows.start("qv").chunk(2, dim=-1)
@@ -194,6 +209,9 @@ class MidpointLoss(WindowLoss):
         # For (q, v) the first half holds by construction.
         self.compared = slice(model.num_coordinates if model.state == "qv" else 0, None)
         self.register_buffer("scale", scale[0, self.compared].float(), persistent=False)
+
+    def evaluations(self, model: ContinuousPredictor, steps: int) -> int:
+        return 1
 
     def forward(self, model: Predictor, windows: Windows) -> Tensor:
         assert isinstance(model, ContinuousPredictor)

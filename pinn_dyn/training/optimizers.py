@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
@@ -52,7 +51,7 @@ class SOAP(Optimizer):
         defaults: dict[str, Any] = {"lr": lr, "betas": tuple(betas), "weight_decay": weight_decay}
         defaults |= {"precondition_frequency": precondition_frequency, "eps": eps}
         super().__init__(params, defaults)
-        self._layouts: dict[int, _Layout] = {}
+        self._batches: dict[int, list[_Batch]] = {}
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -60,152 +59,110 @@ class SOAP(Optimizer):
         with torch.enable_grad():
             loss = None if closure is None else closure()
         for number, group in enumerate(self.param_groups):
-            moved: list[Tensor] = [p for p in group["params"] if p.grad is not None]
-            if moved:
-                self._move(number, group, moved)
+            if not self._batches.get(number):
+                self._batches[number] = _batches([p for p in group["params"] if p.grad is not None])
+            for batch in self._batches[number]:
+                # The state of all parameters of a batch is stored with the first for checkpoints.
+                batch.move(self.state[batch.parameters[0]], group)
         return loss
 
-    def _move(self, number: int, group: dict[str, Any], moved: list[Tensor]) -> None:
-        if number not in self._layouts:
-            self._layouts[number] = _Layout(moved)
-        layout = self._layouts[number]
+
+class _Batch:
+    """Parameters that move together: K matrices of one padded size, or all vectors.
+
+    Args:
+        parameters: the parameters.
+        size: padded numbers of rows and columns; None for vectors, which are matrices of one row.
+    """
+
+    def __init__(self, parameters: list[Tensor], size: tuple[int, int] | None):
+        self.parameters = parameters
+        shapes = [_matrix(p).shape for p in parameters]
+        self._sizes = torch.tensor(shapes, device=parameters[0].device)
+        self._turns = size is not None
+        rows, columns = size or self._sizes.amax(0).tolist()
+        self._gradient = parameters[0].new_zeros(len(parameters), rows, columns)
+        self._change = torch.zeros_like(self._gradient)
+        self._gradients = [x[:m, :n] for x, (m, n) in zip(self._gradient, shapes, strict=True)]
+        self._changes = [x[:m, :n] for x, (m, n) in zip(self._change, shapes, strict=True)]
+
+    def move(self, state: dict[str, Any], group: dict[str, Any]) -> None:
+        """Take a step with the gradients of the parameters."""
         beta1, beta2 = group["betas"]
-        gradient = layout.laid_out([p.grad for p in moved])  # type: ignore[misc]
-        # One state for all parameters, stored with the first parameter for checkpoints.
-        state = self.state[group["params"][0]]
+        gradient = self._gradient
+        gradients: list[Any] = [p.grad for p in self.parameters]
+        torch._foreach_copy_(self._gradients, [_matrix(x) for x in gradients])
+        sides = [(gradient, gradient.mT), (gradient.mT, gradient)] if self._turns else []
         if not state:
             state["step"] = 0
             state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(gradient) for _ in range(2))
-            state["averages"] = [batch.averages(gradient, None, beta2) for batch in layout.batches]
-            pairs = zip(layout.batches, state["averages"], strict=True)
-            state["bases"] = [batch.eigenvectors(pair) for batch, pair in pairs]
+            state["averages"] = [(1 - beta2) * (left @ right) for left, right in sides]
+            state["bases"] = self._eigenvectors(state["averages"])
             return
+        for average, factors in zip(state["averages"], sides, strict=True):
+            average.baddbmm_(*factors, beta=beta2, alpha=1 - beta2)
         state["step"] += 1
-        step, mean, square = state["step"], state["exp_avg"], state["exp_avg_sq"]
-        turned = layout.transformed(gradient, state["bases"])
+        step, mean, square, bases = (state[x] for x in ("step", "exp_avg", "exp_avg_sq", "bases"))
+        turned = _turned(gradient, bases)
         mean.lerp_(gradient, 1 - beta1)
         square.mul_(beta2).addcmul_(turned, turned, value=1 - beta2)
-        update = layout.transformed(mean, state["bases"]).div_(square.sqrt().add_(group["eps"]))
-        update = layout.transformed(update, state["bases"], back=True)
+        update = _turned(mean, bases) / square.sqrt().add_(group["eps"])
         rate = group["lr"] * (1 - beta2**step) ** 0.5 / (1 - beta1**step)
         decay = group["lr"] * group["weight_decay"]
-        update.mul_(rate * (decay - 1)).sub_(layout.laid_out(moved), alpha=decay)
-        torch._foreach_add_(moved, layout.unpacked(update))
-        for k, batch in enumerate(layout.batches):
-            state["averages"][k] = batch.averages(gradient, state["averages"][k], beta2)
-            if step % group["precondition_frequency"] == 0:
-                state["bases"][k] = batch.updated(state["averages"][k], state["bases"][k], square)
+        update = _turned(update, [basis.mT for basis in bases])
+        torch.mul(update, rate * (decay - 1), out=self._change)
+        changes = zip(self._changes, self.parameters, strict=True)
+        torch._foreach_mul_(self.parameters, 1 - decay)
+        torch._foreach_add_(self.parameters, [change.reshape(p.shape) for change, p in changes])
+        if step % group["precondition_frequency"] == 0:
+            state["bases"] = self._updated(state["averages"], bases, square)
 
-
-@dataclass(frozen=True)
-class _Batch:
-    """Matrices ``(K, rows, columns)`` of one padded size, in a vector of numbers."""
-
-    start: int  # position of the first number
-    shape: tuple[int, int, int]
-    sizes: Tensor  # rows and columns of each matrix without padding, (K, 2)
-
-    def view(self, numbers: Tensor) -> Tensor:
-        count, rows, columns = self.shape
-        return numbers[self.start : self.start + count * rows * columns].view(self.shape)
-
-    def averages(
-        self, gradient: Tensor, before: tuple[Tensor, Tensor] | None, beta: float
-    ) -> tuple[Tensor, Tensor]:
-        """Return L and R after a gradient. They start at zero."""
-        g = self.view(gradient)
-        if before is None:
-            return (1 - beta) * (g @ g.mT), (1 - beta) * (g.mT @ g)
-        for average, factors in zip(before, ((g, g.mT), (g.mT, g)), strict=True):
-            average.baddbmm_(*factors, beta=beta, alpha=1 - beta)
-        return before
-
-    def eigenvectors(self, averages: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    def _eigenvectors(self, averages: list[Tensor]) -> list[Tensor]:
         """Return Q_L and Q_R, the largest eigenvalue first, with the identity in the padding."""
-        results = []
-        for average, sizes in zip(averages, self.sizes.T.tolist(), strict=True):
+        bases = []
+        for average, sizes in zip(averages, self._sizes.T.tolist(), strict=False):
             basis = torch.eye(average.shape[-1]).to(average).repeat(len(average), 1, 1)
             for k, n in enumerate(sizes):
                 basis[k, :n, :n] = torch.linalg.eigh(average[k, :n, :n])[1].flip(-1)
-            results.append(basis)
-        return results[0], results[1]
+            bases.append(basis)
+        return bases
 
-    def updated(
-        self, averages: tuple[Tensor, Tensor], bases: tuple[Tensor, Tensor], square: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _updated(self, averages: list[Tensor], bases: list[Tensor], square: Tensor) -> list[Tensor]:
         """Apply a power iteration to Q_L and Q_R, and reorder the second moments."""
-        results, moments = [], self.view(square)
+        results = []
         for k, (average, basis) in enumerate(zip(averages, bases, strict=True)):
             product = average @ basis
             size = product.shape[-1]
-            padding = torch.arange(size, device=product.device) >= self.sizes[:, k, None]
+            padding = torch.arange(size, device=product.device) >= self._sizes[:, k, None]
             values = (basis * product).sum(-2).masked_fill_(padding, -torch.inf)
             order = values.argsort(dim=-1, descending=True)
             along = order.unsqueeze(-1) if k == 0 else order.unsqueeze(-2)
-            moments.copy_(moments.take_along_dim(along, dim=k + 1))
+            square.copy_(square.take_along_dim(along, dim=k + 1))
             # The zero columns of the padding are last, and become those of the identity.
             results.append(torch.linalg.qr(product.take_along_dim(order.unsqueeze(-2), dim=-1))[0])
-        return results[0], results[1]
+        return results
 
 
-class _Layout:
-    """Positions of the numbers of all parameters in a vector: batches of matrices, then vectors."""
+def _batches(parameters: list[Tensor]) -> list[_Batch]:
+    by_size: dict[tuple[int, int] | None, list[Tensor]] = {}
+    for parameter in parameters:
+        rows, columns = _matrix(parameter).shape
+        size = None if parameter.ndim < 2 else (_padded(rows), _padded(columns))
+        by_size.setdefault(size, []).append(parameter)
+    return [_Batch(batch, size) for size, batch in by_size.items()]
 
-    def __init__(self, parameters: list[Tensor]):
-        device = parameters[0].device
-        sizes = [p.numel() for p in parameters]
-        total = sum(sizes)
-        by_size: dict[tuple[int, int], list[Tensor]] = {}
-        vectors = []
-        for p, numbers in zip(parameters, torch.arange(total).split(sizes), strict=True):
-            if p.ndim < 2:
-                vectors.append(numbers)
-                continue
-            rows, columns = p.shape[0], p.shape[1:].numel()
-            padded = _padded(rows), _padded(columns)
-            by_size.setdefault(padded, []).append(numbers.view(rows, columns))
-        self.batches: list[_Batch] = []
-        positions: list[Tensor] = []  # in the parameters; the last one is a zero
-        start = 0
-        for (rows, columns), matrices in by_size.items():
-            shape = (len(matrices), rows, columns)
-            block = torch.full(shape, total)
-            for padded_matrix, matrix in zip(block, matrices, strict=True):
-                padded_matrix[: matrix.shape[0], : matrix.shape[1]] = matrix
-            true_sizes = torch.tensor([matrix.shape for matrix in matrices], device=device)
-            self.batches.append(_Batch(start, shape, true_sizes))
-            positions.append(block.flatten())
-            start += block.numel()
-        positions += vectors
-        self._vectors = slice(start, None)
-        self._positions = torch.cat(positions).to(device)
-        back = self._positions.new_empty(total + 1)
-        back[self._positions] = torch.arange(len(self._positions), device=device)
-        self._back = back[:-1]
-        self._zero = parameters[0].new_zeros(1)
-        self._apart = parameters[0].new_empty(total)
-        parts = zip(self._apart.split(sizes), parameters, strict=True)
-        self._parts = [part.view(p.shape) for part, p in parts]
 
-    def laid_out(self, values: list[Tensor]) -> Tensor:
-        """Return the numbers of tensors in the shapes of the parameters, with padding."""
-        numbers = torch.cat([*(value.flatten() for value in values), self._zero])
-        return numbers.index_select(0, self._positions)
+def _matrix(value: Tensor) -> Tensor:
+    """Return a tensor as a matrix: the first dimension is that of the rows; vectors are a row."""
+    return value.flatten(1) if value.ndim > 1 else value.reshape(1, -1)
 
-    def unpacked(self, numbers: Tensor) -> list[Tensor]:
-        """Return tensors in the shapes of the parameters. The next call overwrites them."""
-        torch.index_select(numbers, 0, self._back, out=self._apart)
-        return self._parts
 
-    def transformed(self, numbers: Tensor, bases: list[Any], back: bool = False) -> Tensor:
-        """Transform the matrices to their bases, or back. Vectors do not change."""
-        result = torch.empty_like(numbers)
-        result[self._vectors] = numbers[self._vectors]
-        for batch, (left, right) in zip(self.batches, bases, strict=True):
-            if back:
-                left, right = left.mT, right.mT
-            torch.bmm(left.mT @ batch.view(numbers), right, out=batch.view(result))
-        return result
+def _turned(matrices: Tensor, bases: list[Tensor]) -> Tensor:
+    """Return Q_L^T X Q_R of matrices X ``(K, rows, columns)``. Vectors have no bases."""
+    if not bases:
+        return matrices
+    left, right = bases
+    return left.mT @ matrices @ right
 
 
 def _padded(size: int) -> int:

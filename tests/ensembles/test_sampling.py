@@ -79,7 +79,7 @@ def test_the_common_factor_of_learned_gains_is_log_normal_about_the_fit():
     assert float(gains.mean()) == pytest.approx(0.0, abs=3 * deviation / COUNT**0.5)
     assert float(gains.std()) == pytest.approx(deviation, rel=0.15)
     at = states(motion)
-    expected, *inputs = (x.inverse_dynamics(*at) / x.input_gain() for x in (model, *draws))
+    expected, *inputs = (x.inverse_dynamics(*at) / x.drives.strength() for x in (model, *draws))
     error = (torch.stack(inputs) - expected) / expected.std(0)
     assert error.square().mean().sqrt() < 0.02
 
@@ -114,7 +114,7 @@ def test_the_spread_is_that_of_the_posterior_where_no_body_is_near_its_limit():
 def test_parameters_of_bodies_are_the_inverse_of_the_bodies():
     bodies = known_model().bodies
     z = torch.randn(5, *bodies.z.shape, generator=torch.Generator().manual_seed(0)).double()
-    inertia = bodies.inertia_of(z)
+    inertia = bodies.value_of(z)
     torch.testing.assert_close(bodies.parameters_of(inertia), z)
 
 

@@ -44,9 +44,9 @@ def test_values_are_those_of_the_definition(kind):
     for count in (1, 2, 7):
         signal = make_signal(kind, count)
         times = [*np.linspace(-0.3, float(signal.t[-1]) + 0.4, 12), *signal.t.tolist()]
-        for time in times:
-            found = signal(time).numpy()
-            np.testing.assert_allclose(found, expected_value(signal, time), atol=1e-12, rtol=0)
+        values = signal.at(torch.tensor(times, dtype=torch.float64)).numpy()
+        for time, value in zip(times, values, strict=True):
+            np.testing.assert_allclose(value, expected_value(signal, time), atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -90,11 +90,10 @@ def test_a_part_of_a_cubic_is_the_cubic_of_the_whole():
     """A window does not know its neighbours, its rates do."""
     whole = make_signal("cubic", count=9)
     part = whole.part(slice(3, 6))
-    for time in np.linspace(float(part.t[0]), float(part.t[-1]), 7):
-        torch.testing.assert_close(part(time), whole(time), rtol=0, atol=1e-14)
-    again = Signal(part.t, part.u, "cubic")
-    middle = float(part.t[:2].mean())
-    assert (again(middle) - whole(middle)).abs().max() > 1e-3
+    times = torch.linspace(float(part.t[0]), float(part.t[-1]), 7, dtype=torch.float64)
+    torch.testing.assert_close(part.at(times), whole.at(times), rtol=0, atol=1e-14)
+    again, middle = Signal(part.t, part.u, "cubic"), part.t[:2].mean()[None]
+    assert (again.at(middle) - whole.at(middle)).abs().max() > 1e-3
 
 
 def test_stacked_cubics_keep_their_rates():

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
-from pinn_dyn.mechanics.compilation import Unrolled, integrated_by
+from pinn_dyn.mechanics.compilation import integrated_by
 from pinn_dyn.mechanics.integrators import Sticking
 from pinn_dyn.models import CoulombFriction
 from pinn_dyn.run.export import export
@@ -279,10 +279,9 @@ def test_loops_and_batches_equal_single_steps(monkeypatch, tmp_path):
         for k, sign in enumerate((1, -1)):
             alone = system.predict(x0[k], t, Signal(t, sign * u))
             torch.testing.assert_close(alone, expected[k], rtol=0, atol=1e-12)
-        for wrapper in (Unrolled, CLoop):
-            with integrated_by(system, wrapper(system.integrator)):
-                path = system.predict(x0, t, both)
-            torch.testing.assert_close(path, expected, rtol=0, atol=1e-12)
+        with integrated_by(system, CLoop(system.integrator)):
+            path = system.predict(x0, t, both)
+        torch.testing.assert_close(path, expected, rtol=0, atol=1e-12)
     assert len(codes()) == 1
 
 

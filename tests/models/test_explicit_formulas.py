@@ -48,7 +48,7 @@ def hamiltonian_derivative(model, x, u):
     """d(q, p)/dt from the gradient of H(q, p) = p^T W p / 2 + V, paper eq. (hamiltonian_dyn)."""
 
     def hamiltonian(q, p):
-        return 0.5 * p @ model.inverse_mass_matrix(q) @ p + model.potential_energy(q)
+        return 0.5 * p @ model.inverse_mass.matrix(q) @ p + model.potential_energy(q)
 
     def rates(q, p, u):
         v = grad(hamiltonian, 1)(q, p)

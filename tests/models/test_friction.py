@@ -102,7 +102,7 @@ def test_parameters_of_an_own_head_are_in_the_table_too():
         def __init__(self, scales):
             super().__init__(scales)
             self.factor = torch.nn.Parameter(torch.zeros(scales.size))
-            self.rate = scales.positive("drag", 0.1, scales.value, 1.0, ["Nms/rad"] * scales.size)
+            self.rate = scales.positive("drag", 0.1, scales.value, 1.0, "damping")
 
     model = known_model(friction=None)
     model.friction = Cubic(unit_scales(4))

@@ -87,7 +87,7 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     compiled = engine(Compiled, loss, model, STEPS_FOR_PROGRAM)
     eager = engine(Eager, loss, untouched)
     batches = [windows(8), spread_out(windows(8, seed=1)), windows(24, seed=2)]
-    evaluations = compiled.evaluations(batches[0])
+    evaluations = loss.evaluations(model, steps=1)
     assert evaluations == (1 if kind_of_loss is MidpointLoss else len(model.integrator.nodes))
     parts = 2 * evaluations  # of 8 windows
     monkeypatch.setattr("pinn_dyn.training.gradients.CHUNK", parts)
@@ -160,8 +160,10 @@ def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
     loss = IncrementLoss(one_step(size=2), model).double()
     batch = make_windows(25, size=2)
     compiled = engine(Compiled, loss, model, 100)
-    seen = []
-    monkeypatch.setattr(compiled, "_loss", lambda part: seen.append(len(part)) or loss(model, part))
+    seen, of_part = [], compiled._loss_and_gradient
+    monkeypatch.setattr(
+        compiled, "_loss_and_gradient", lambda part: seen.append(len(part)) or of_part(part)
+    )
     assert_same(compiled(batch), Eager(loss, model, compiled.vector)(batch))
     assert seen == [9, 8, 8]
 

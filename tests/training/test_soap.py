@@ -36,15 +36,14 @@ def steps(several, alone, optimizers, count, seed):
 
 def take_bases(ours, several, theirs, alone):
     """Give the library our first bases: where a gradient leaves one open, rounding chooses it."""
-    state, layout = ours.state[several[0]], ours._layouts[0]
-    of_size = {}
-    for batch, pair in zip(layout.batches, state["bases"], strict=True):
-        for k, (rows, columns) in enumerate(batch.sizes.tolist()):
-            left, right = pair[0][k, :rows, :rows], pair[1][k, :columns, :columns]
-            of_size.setdefault((rows, columns), []).append([left.clone(), right.clone()])
-    for parameter in alone:
-        if parameter.ndim == 2:
-            theirs.state[parameter]["Q"] = of_size[tuple(parameter.shape)].pop(0)
+    for batch in ours._batches[0]:
+        bases = ours.state[batch.parameters[0]]["bases"]
+        for k, parameter in enumerate(batch.parameters):
+            (position,) = [j for j, other in enumerate(several) if other is parameter]
+            if bases:
+                pairs = zip(bases, parameter.shape, strict=True)
+                turned = [basis[k, :size, :size].clone() for basis, size in pairs]
+                theirs.state[alone[position]]["Q"] = turned
 
 
 def test_every_matrix_moves_as_it_does_alone():
@@ -68,11 +67,11 @@ def test_the_zeros_that_fill_a_matrix_up_stay_zeros():
     several = parameters()
     optimizer = SOAP(several, **SETTINGS)
     steps(several, copies(several), [optimizer], 13, seed=1)
-    state = optimizer.state[several[0]]
     filled = 0
-    for batch, bases in zip(optimizer._layouts[0].batches, state["bases"], strict=True):
-        for k, sizes in enumerate(batch.sizes.tolist()):
-            for basis, size in zip(bases, sizes, strict=True):
+    for batch in optimizer._batches[0]:
+        bases = optimizer.state[batch.parameters[0]]["bases"]
+        for k, parameter in enumerate(batch.parameters):
+            for basis, size in zip(bases, parameter.shape, strict=False):
                 assert (basis[k, :size, size:] == 0).all()
                 assert (basis[k, size:, :size] == 0).all()
                 filled += basis.shape[-1] - size

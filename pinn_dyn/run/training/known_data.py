@@ -185,7 +185,7 @@ def check_known(model: KnownMechanics, source: DataSource) -> None:
     if model.gain is None and not model.drives.takes_targets:
         inputs = [
             f"{name} in {unit}"
-            for (name, unit), gain in zip(u.items(), model.input_gain().tolist(), strict=False)
+            for (name, unit), gain in zip(u.items(), model.drives.strength().tolist(), strict=False)
             if unit not in ("", "N", "Nm") and gain == 1
         ]
         if inputs:
@@ -203,7 +203,7 @@ def warn_of_log(model: Any, source: DataSource) -> None:
         return
     drives = model.drives if isinstance(model, KnownMechanics) else None
     structure = double_copy(model).structure if drives and not drives.takes_targets else None
-    is_limited = drives is not None and drives.limited
+    is_limited = drives is not None and drives.largest_input() is not None
     for text in verdict(source, structure):
         if not (is_limited and SATURATES in text):
             log.warning("%s: %s", source.name, text)
