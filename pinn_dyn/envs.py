@@ -66,6 +66,7 @@ class ModelPlant(Plant):
         self._originals = [*(draws or [model])]
         self._step, self._threads = step, threads
         self._delay = torch.zeros(model.num_inputs) if delay is None else delay
+        self._longest = max(self._delay.tolist(), default=0.0)
         self._copy()
 
     def _copy(self) -> None:
@@ -91,15 +92,14 @@ class ModelPlant(Plant):
         self._inputs = [torch.where(chosen[:, None], 0.0, u) for u in self._inputs]
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        longest = max(self._delay.tolist(), default=0.0)
-        self._inputs = [*self._inputs, u][-(math.ceil(longest / duration) + 1) :]
+        self._inputs = [*self._inputs, u][-(math.ceil(self._longest / duration) + 1) :]
         count = math.ceil(duration / self._step - 1e-6)
         self._loop = self._loop or self._ready()
-        if self._loop is None or longest > 0:
+        if self._loop is None or self._longest > 0:
             self._x = self._x + self._path(duration, count)
         else:
             stages = len(self._model.integrator.nodes)
-            inputs = u[:, None, None].expand(-1, count, stages, -1)
+            inputs = u.view(len(self._x), 1, 1, self.num_inputs).expand(-1, count, stages, -1)
             lengths = self._x.new_full((count,), duration / count)
             zero = torch.zeros_like(self._x)
             self._x = self._x + self._loop(zero, self._x, inputs, lengths, self._threads)[:, -1]
@@ -213,9 +213,8 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold an input ``(M,)``, clipped to its limits, for a step."""
-        results = self._robots.step(np.asarray(action)[None])
-        observation, reward, terminated, truncated = (x[0] for x in results[:4])
-        return observation, float(reward), bool(terminated), bool(truncated), self._info()
+        seen, rewards, terminated, truncated, _ = self._robots.step(np.asarray(action)[None])
+        return seen[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info()
 
     def _info(self) -> dict[str, Any]:
         q, v = self._robots._q[0], self._robots._v[0]
@@ -307,6 +306,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         self.single_observation_space = observations
         spaces = gymnasium.vector.utils.batch_space(inputs, num_envs)
         self.action_space = cast(gymnasium.spaces.Box, spaces)
+        self._low, self._high = (x.astype(float) for x in (low, high))
         self.observation_space = gymnasium.vector.utils.batch_space(observations, num_envs)
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset)}
 
@@ -339,7 +339,8 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold inputs ``(K, M)``, clipped to their limits, for a step."""
         mode, ended = self.metadata["autoreset_mode"], self._is_over
-        if mode == AutoresetMode.DISABLED and ended.any():
+        has_ended = np.count_nonzero(ended)  # faster than any()
+        if has_ended and mode == AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
                 f"the episodes of {ended.sum()} robots have ended: start them again by "
                 'reset(options={"reset_mask": terminated | truncated})'
@@ -348,21 +349,21 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
             raise ValueError(
                 f"the action has the shape {np.shape(actions)}, expected {self.action_space.shape}"
             )
-        u = np.minimum(np.maximum(actions, self.action_space.low), self.action_space.high)
-        u = u.astype(float)
+        u = np.minimum(np.maximum(actions, self._low), self._high)
         q, v = (x.numpy() for x in self.plant.advance(torch.from_numpy(u), self.dt))
-        diverged = ~(np.isfinite(q).all(1) & np.isfinite(v).all(1)) & ~ended
-        self._q, self._v = (
-            np.where(diverged[:, None], before, after)
-            for before, after in ((self._q, q), (self._v, v))
-        )
         self._count += 1
+        finite, diverged = np.isfinite(q + v), np.zeros(self.num_envs, dtype=bool)
+        if np.count_nonzero(finite) < finite.size:
+            diverged = ~finite.all(1) & ~ended
+            q, v = (np.where(diverged[:, None], *x) for x in ((self._q, q), (self._v, v)))
+        self._q, self._v = q, v
         if self.reward is None:
-            rewards = -np.square(self._q - self._goal).sum(1)
+            rewards = -np.square(q - self._goal) @ np.ones(q.shape[1])
         else:
-            rewards = self.reward(self._q, self._v, u)
-        rewards = np.where(diverged, rewards * (self.steps - self._count + 1), rewards)
-        if ended.any():
+            rewards = self.reward(q, v, u)
+        if np.count_nonzero(diverged):
+            rewards = np.where(diverged, rewards * (self.steps - self._count + 1), rewards)
+        if has_ended:
             rewards = np.where(ended, 0.0, rewards)
             self._restart(ended)
         truncated = self._count >= self.steps
@@ -379,6 +380,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         return self.region.distance(torch.from_numpy(self._q), torch.from_numpy(self._v)).numpy()
 
     def _restart(self, ended: np.ndarray) -> None:
+        self._q, self._v = self._q.copy(), self._v.copy()  # views of states of the plant
         self._q[ended], self._v[ended], self._goal[ended] = self._drawn(int(ended.sum()))
         starts = (torch.from_numpy(x[ended]) for x in (self._q, self._v))
         if isinstance(self.plant, ModelPlant):
