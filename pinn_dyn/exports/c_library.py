@@ -6,9 +6,7 @@ import ctypes
 import hashlib
 import logging
 import os
-import shutil
 import subprocess
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -29,8 +27,6 @@ QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
 sticking joints. The code has 0.7 to 0.8 of the speed (benchmarks/long_rollout.py)."""
 
 _MOST_PROGRAMS = 100  # in the cache folder
-_UNFINISHED = "unfinished-"  # start of the names of folders of running compilations
-_LONGEST = 3600.0  # time of a compilation, s
 
 
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
@@ -52,9 +48,7 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     for library in _unchanged(digest, "so"):
         return ctypes.CDLL(str(library))
     is_cache = _is_safe(folder) and os.access(folder, os.W_OK)
-    if is_cache:
-        _remove_unfinished(folder)
-    with TemporaryDirectory(dir=folder if is_cache else None, prefix=_UNFINISHED) as name:
+    with TemporaryDirectory(dir=folder if is_cache else None) as name:
         source = Path(name) / "code.c"
         source.write_text(code)
         compiled = compile_c(compiler, flags, source)
@@ -65,20 +59,12 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     return loaded
 
 
-def _remove_unfinished(folder: Path) -> None:
-    """Delete unfinished compilations of killed processes."""
-    for path in folder.glob(f"{_UNFINISHED}*"):
-        with suppress(OSError):
-            if time.time() - path.stat().st_mtime > _LONGEST:
-                shutil.rmtree(path)
-
-
 def remember(key: str, content: Any) -> None:
     """Store tensors and plain values in the cache folder, for :func:`recall` in later processes."""
     folder = _folder()
     if not _is_safe(folder):
         return
-    with suppress(OSError), TemporaryDirectory(dir=folder, prefix=_UNFINISHED) as name:
+    with suppress(OSError), TemporaryDirectory(dir=folder) as name:
         path = Path(name) / "code.pt"
         torch.save(content, path)
         path.chmod(0o600)

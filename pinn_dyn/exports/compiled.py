@@ -19,6 +19,7 @@ from torch import Tensor
 from pinn_dyn.exports.c_code import PRELUDE
 from pinn_dyn.exports.c_file import find_compiler, static_functions
 from pinn_dyn.exports.c_library import QUICK, load_code, recall, remember
+from pinn_dyn.exports.exported_function import errors_of_rows
 from pinn_dyn.exports.live_numbers import LiveNumbers
 from pinn_dyn.exports.program import Constants, Program
 from pinn_dyn.exports.repeated import programs
@@ -31,7 +32,6 @@ BUILD_SECONDS = 1.0
 """Processor time in Python after which code is built, s; about the time of building."""
 STATES = 20
 """Number of states at which code is compared with Python before it is used."""
-_MOST = 64
 _TOLERANCE = 1e-9
 
 Function = Callable[..., Tensor]
@@ -236,8 +236,6 @@ class Compiled:
         function = kind.loaded(load_code(code.text, kind.flags), values)
         if not kind.agrees(function):
             return None
-        if len(_CODES) >= _MOST:
-            _CODES.pop(next(iter(_CODES)))
         _CODES[key] = code
         return function
 
@@ -253,18 +251,9 @@ def _identity(value: Tensor) -> tuple[Any, ...]:
 
 
 def agree(results: Tensor, expected: Tensor) -> bool:
-    """Return true if results ``(K, ...)`` equal the expected results up to rounding.
-
-    Differences are relative to the norm of a row, or to the RMS of all norms if this is larger. If
-    an expected row is not finite, the result must not be finite either.
-    """
-    rows, truth = results.flatten(1), expected.flatten(1)
-    finite = truth.isfinite().all(-1)
-    norms = torch.linalg.vector_norm(truth, dim=-1)
-    typical = norms[finite].square().mean().sqrt() if finite.any() else norms.new_zeros(())
-    error = torch.linalg.vector_norm(rows - truth, dim=-1)
-    close = error <= _TOLERANCE * torch.maximum(norms, typical) + 1e-12
-    return bool(torch.where(finite, close, ~rows.isfinite().all(-1)).all())
+    """Return true if results ``(K, ...)`` equal the expected results up to rounding."""
+    errors, scales = errors_of_rows(results, expected)
+    return bool((errors <= _TOLERANCE * scales + 1e-12).all())
 
 
 def spread_around(rows: Tensor) -> Tensor:

@@ -2,10 +2,8 @@
 
 import json
 import logging
-import os
 import re
 import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -82,15 +80,6 @@ def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
     assert_refused(tmp_path, r"cc does not compile f\.c: .*error")
 
 
-@pytest.mark.parametrize(
-    ("code", "end"), [("{0}; for (;;)", "timed out"), ("*(volatile real *)0 * {0}", "SIGSEGV")]
-)
-def test_code_that_does_not_return_ends_with_a_message(tmp_path, monkeypatch, code, end):
-    monkeypatch.setitem(ELEMENTWISE, "sin", code)
-    monkeypatch.setattr("pinn_dyn.exports.c_file.TIME_LIMIT", 0.5)
-    assert_refused(tmp_path, rf"sine cannot be compared: .*{end}")
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_number_that_is_not_finite_differs_from_every_number(value):
     """On either side: in the file, or in the original."""
@@ -131,16 +120,6 @@ def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
 def test_a_compiler_with_an_open_quote_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "gcc -DNAME='a")
     assert_refused(tmp_path, r"CC is .* expected the command of a C compiler", ValueError)
-
-
-def test_folders_of_exports_that_were_killed_are_removed(tmp_path):
-    """After a day, as another program may still write to a newer one."""
-    for name, age in (("old", 90_000), ("new", 60)):
-        folder = tmp_path / f".export-{name}"
-        folder.mkdir()
-        os.utime(folder, (time.time() - age, time.time() - age))
-    write([SINE], tmp_path / "f.c", {})
-    assert sorted(x.name for x in tmp_path.iterdir()) == [".export-new", "f.c", "f.h"]
 
 
 class Bessel(torch.nn.Module):
