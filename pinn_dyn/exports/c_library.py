@@ -26,8 +26,6 @@ QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
 """Flags of an optimization with a third of the compilation time of ``-O3``, for a rigid chain with
 sticking joints. The code has 0.7 to 0.8 of the speed (benchmarks/long_rollout.py)."""
 
-_MOST_PROGRAMS = 100  # in the cache folder
-
 
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     """Load C code as a library; compile it for this processor if the cache folder has none.
@@ -69,9 +67,8 @@ def remember(key: str, content: Any) -> None:
         torch.save(content, path)
         path.chmod(0o600)
         earlier = [*folder.glob(f"{key}-*.pt")]
-        oldest = sorted(folder.glob("*.pt"), key=lambda x: x.stat().st_mtime)
         os.replace(path, folder / f"{key}-{_sha256(path)}.pt")
-        for old in {*earlier, *oldest[:-_MOST_PROGRAMS]}:
+        for old in earlier:
             old.unlink(missing_ok=True)
 
 
@@ -79,7 +76,6 @@ def recall(key: str) -> Any:
     """Return the content that :func:`remember` has stored, or None."""
     for path in _unchanged(key, "pt"):
         with suppress(Exception):  # of another version of PyTorch
-            os.utime(path)  # the oldest files are deleted
             return torch.load(path, weights_only=True)
     return None
 

@@ -61,9 +61,9 @@ def test_a_step_integrates_as_the_prediction_does(tmp_path):
     torch.testing.assert_close(v_next, model.velocity(end[:3], end[3:]))
 
 
-def assert_refused(tmp_path, message, error=RuntimeError, **options):
-    with pytest.raises(error, match=message):
-        write([SINE], tmp_path / "out" / "f.c", {}, **options)
+def assert_refused(tmp_path, message):
+    with pytest.raises(RuntimeError, match=message):
+        write([SINE], tmp_path / "out" / "f.c", {})
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -108,18 +108,13 @@ def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
 ):
     monkeypatch.setenv("CC", "/nonexistent")
     path = write([SINE], tmp_path / "f.c", {})
-    assert "f.c was not compared with the model: no C compiler (/nonexistent)" in caplog.text
+    assert "f.c was not compared with the model: no C compiler" in caplog.text
     monkeypatch.setenv("CC", "cc -DUNUSED")
     np.testing.assert_allclose(function_of(path, "f_sine")(0.3), [[np.sin(0.3)]])
     caplog.clear()
     with caplog.at_level(logging.WARNING):
         write([SINE], tmp_path / "f.c", {})
     assert not caplog.text
-
-
-def test_a_compiler_with_an_open_quote_is_named(tmp_path, monkeypatch):
-    monkeypatch.setenv("CC", "gcc -DNAME='a")
-    assert_refused(tmp_path, r"CC is .* expected the command of a C compiler", ValueError)
 
 
 class Bessel(torch.nn.Module):
