@@ -232,7 +232,8 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     distances from the training data.
 
     Args:
-        robot: a run or its folder, or a :class:`ModelPlant`.
+        robot: a run or its folder, or a :class:`ModelPlant`; for K = 1, any robot of
+            :class:`RobotEnv`.
         num_envs: K.
         data, step, duration, u_low, u_high: see :class:`RobotEnv`.
         reward: rewards of a step for arrays of K robots; None for the distance to a goal.
@@ -247,11 +248,12 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     """
 
     action_space: gymnasium.spaces.Box
+    single_action_space: gymnasium.spaces.Box
     _is_over: np.ndarray
 
     def __init__(
         self,
-        robot: Run | ModelPlant | str | Path,
+        robot: Run | MechanicalSystem | Plant | str | Path,
         num_envs: PositiveInt,
         *,
         data: Run | DataSource | None = None,

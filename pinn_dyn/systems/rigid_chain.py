@@ -83,17 +83,6 @@ class RigidChain(MechanicalSystem):
     """
 
     z_is_down = False
-    inertia: Tensor
-    _gravity: Tensor
-    _placements: Tensor
-    _axes: Tensor
-    _turning: Tensor
-    _moved: Tensor
-    _coupling: Tensor
-    _damping: Tensor
-    _screws: Tensor
-    _basis: Tensor
-    _tip_pose: Tensor
 
     def __init__(
         self,

@@ -59,11 +59,6 @@ class SoftArm(MechanicalSystem):
     """
 
     z_is_down = True
-    mass: Tensor
-    stiffness: Tensor
-    damping: Tensor
-    _s: Tensor
-    _weights: Tensor
 
     def __init__(
         self,
