@@ -20,7 +20,7 @@ from pinn_dyn.exports.c_code import PRELUDE, ConstantArrays
 from pinn_dyn.exports.escaping import c_text
 from pinn_dyn.exports.exported_function import DTYPES, Calls, ExportedFunction, Real, identifier
 from pinn_dyn.exports.program import Program
-from pinn_dyn.exports.scalar_code import CBody, c_function
+from pinn_dyn.exports.scalar_code import CBody, c_functions
 
 log = logging.getLogger(__name__)
 
@@ -37,16 +37,15 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     name = identifier(path.stem)
     constants = ConstantArrays(real)
     parts: dict[str, tuple[Program, CBody]] = {}
-    programs, bodies, calls = [], [], []
+    bodies, calls = [], []
     for function in functions:
-        inner = function.programs()
+        inner = c_functions(function.programs(), constants)
         calls.append(len(inner) > 1)
-        programs.append(inner.pop(function.name))
-        bodies.append(c_function(programs[-1], constants))
-        parts |= {x: (p, c_function(p, constants)) for x, p in inner.items()}
+        bodies.append(inner.pop(function.name))
+        parts |= inner
     code = [f"typedef {real} real;", PRELUDE, *constants.definitions(), *static_functions(parts)]
     declarations, deepest = [], max((body.stack for _, body in parts.values()), default=0)
-    for function, program, body, has_calls in zip(functions, programs, bodies, calls, strict=True):
+    for function, (program, body), has_calls in zip(functions, bodies, calls, strict=True):
         stack = body.stack + deepest * has_calls
         signature = _signature(function.name, program, name, real)
         declarations += [
@@ -93,7 +92,7 @@ def write_c(functions: Sequence[ExportedFunction], path: Path, info: str, real: 
     library = ctypes.CDLL(str(compile_c(compiler, flags, path)))
     return {
         function.name: _call(library[f"{name}_{function.name}"], program, real)
-        for function, program in zip(functions, programs, strict=True)
+        for function, (program, _) in zip(functions, bodies, strict=True)
     }
 
 
@@ -104,9 +103,11 @@ def static_functions(
 
     ``arguments`` are declarations of additional arguments.
     """
-    code = []
+    code, qualifier = [], "restrict" if arguments else ""
     for name, (program, body) in parts.items():
-        names = [*arguments, *(f"const real *{x}" for x in program.inputs), "real *result"]
+        kinds = {x: "const real *" if len(n) else "double " for x, n in program.inputs.items()}
+        kinds |= dict.fromkeys(program.outputs, f"real *{qualifier} ")
+        names = [*arguments, *(f"{kind}{x}" for x, kind in kinds.items())]
         unused = [f"(void){x};" for x in program.inputs]
         code += [f"\nstatic void {name}({', '.join(names)})"]
         code += ["{", *(f"  {line}" for line in [*unused, *body.lines]), "}"]

@@ -23,7 +23,7 @@ from pinn_dyn.exports.exported_function import errors_of_rows
 from pinn_dyn.exports.live_numbers import LiveNumbers
 from pinn_dyn.exports.program import Constants, Program
 from pinn_dyn.exports.repeated import programs
-from pinn_dyn.exports.scalar_code import c_function
+from pinn_dyn.exports.scalar_code import c_functions
 from pinn_dyn.exports.watch import Watch
 
 log = logging.getLogger(__name__)
@@ -269,8 +269,6 @@ def spread_around(rows: Tensor) -> Tensor:
 class _Rows(Kind):
     """A function that maps the rows of a tensor independently."""
 
-    flags = QUICK
-
     def __init__(self, name: str, function: Callable[[Tensor], Tensor], rows: Tensor):
         self.name, self._function = name, function
         self._rows = rows.reshape(-1, rows.shape[-1])
@@ -279,17 +277,13 @@ class _Rows(Kind):
         return programs("row", self._function, {"x": self._rows[0]}, ["y"])
 
     def text(self, programs: dict[str, Program], numbers: LiveNumbers) -> str:
-        *parts, (_, program) = programs.items()
-        n, m = program.inputs["x"].numel(), program.outputs["y"].numel()
-        bodies = {name: (part, c_function(part, numbers)) for name, part in parts}
-        lines = c_function(program, numbers).lines
+        functions = static_functions(c_functions(programs, numbers), ["double *values"])
         return _ROWS.format(
             prelude=PRELUDE,
             definitions="\n".join(numbers.definitions()),
-            parts="\n".join(static_functions(bodies, ["const double *values"])),
-            lines="\n".join(lines),
-            n=n,
-            m=m,
+            functions="\n".join(functions),
+            n=programs["row"].inputs["x"].numel(),
+            m=programs["row"].outputs["y"].numel(),
         )
 
     def loaded(self, library: ctypes.CDLL, values: Tensor) -> Function:
@@ -318,12 +312,8 @@ typedef double real;
 {prelude}
 #define VALUES values
 {definitions}
-{parts}
-static void row(const double *values, const real *restrict x, real *restrict y)
-{{
-{lines}
-}}
+{functions}
 int outputs(void) {{ return {m}; }}
-void rows(const double *values, long count, const real *x, real *y)
+void rows(double *values, long count, const real *x, real *y)
 {{ for (; count > 0; count--, x += {n}, y += {m}) row(values, x, y); }}
 """

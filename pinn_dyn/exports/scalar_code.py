@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import itertools
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -336,6 +336,13 @@ def c_function(program: Program, constants: ConstantArrays) -> CBody:
     """Return a C function, without loops if the program has no large matrix of learned numbers."""
     kind = ScalarFunction if _is_scalar(program) else CFunction
     return kind(program, constants)
+
+
+def c_functions(
+    programs: Mapping[str, Program], constants: ConstantArrays
+) -> dict[str, tuple[Program, CBody]]:
+    """Return programs and their C functions by name."""
+    return {name: (x, c_function(x, constants)) for name, x in programs.items()}
 
 
 def _is_scalar(program: Program) -> bool:
