@@ -65,7 +65,7 @@ class Code(NamedTuple):
         values = []
         for packed, sources in zip(self.constants, self.leaves, strict=True):
             leaves = [x if isinstance(x, Tensor) else tensors[x] for x in sources]
-            values.append(Constants.unpacked(packed, leaves).evaluate())
+            values.append(Constants(leaves, *packed).evaluate())
         constants = torch.cat(values)
         if not torch.equal(constants[self.places], self.numbers):
             return None
@@ -220,7 +220,7 @@ class Compiled:
             leaves.append([addresses.get(_identity(x), x.detach().clone()) for x in item.leaves])
         return Code(
             text,
-            [item.packed() for item in constants],
+            [[item.operations, item.results] for item in constants],
             leaves,
             torch.tensor(numbers.index, dtype=torch.int64),
             torch.tensor([*numbers.fixed], dtype=torch.int64),
