@@ -92,10 +92,10 @@ class ModelPlant(Plant):
         self._inputs = [torch.where(chosen[:, None], 0.0, u) for u in self._inputs]
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        self._inputs = [*self._inputs, u][-(math.ceil(self._longest / duration) + 1) :]
         count = math.ceil(duration / self._step - 1e-6)
         self._loop = self._loop or self._ready()
         if self._loop is None or self._longest > 0:
+            self._inputs = [*self._inputs, u][-(math.ceil(self._longest / duration) + 1) :]
             self._x = self._x + self._path(duration, count)
         else:
             stages = len(self._model.integrator.nodes)
@@ -302,6 +302,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         u = torch.cat([item.u for item in train])
         low = np.asarray(u.amin(0) if u_low is None else u_low, dtype=np.float32)
         high = np.asarray(u.amax(0) if u_high is None else u_high, dtype=np.float32)
+        self._ones = np.ones(q[0].shape[1])
         inputs = self.single_action_space = gymnasium.spaces.Box(low, high)
         size = (3 if reward is None else 2) * q[0].shape[1]
         observations = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
@@ -360,7 +361,7 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
             q, v = (np.where(diverged[:, None], *x) for x in ((self._q, q), (self._v, v)))
         self._q, self._v = q, v
         if self.reward is None:
-            rewards = -np.square(q - self._goal) @ np.ones(q.shape[1])
+            rewards = -np.square(q - self._goal) @ self._ones
         else:
             rewards = self.reward(q, v, u)
         if np.count_nonzero(diverged):

@@ -258,11 +258,8 @@ def _read(urdf: str) -> tuple[Path, ET.Element]:
         element.tag = element.tag.rpartition("}")[2]
     robot = root if root.tag == "robot" else root.find(".//robot")
     if robot is None:
-        kind, cure = f"XML with the root <{root.tag}>", ""
-        if root.tag == "sdf":
-            convert = f"rosrun pysdf sdf2urdf.py {shlex.quote(str(path))} robot.urdf"
-            kind, cure = "SDF", f": convert it by pysdf, {convert}"
-        raise ValueError(f"{path} is {kind}, expected the URDF or the MJCF of the robot{cure}")
+        kind = f"XML with the root <{root.tag}>"
+        raise ValueError(f"{path} is {kind}, expected the URDF or the MJCF of the robot")
     return path, robot
 
 
