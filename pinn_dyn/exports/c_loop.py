@@ -53,12 +53,8 @@ class CLoop(Wrapped):
         """
         u = x.new_zeros(len(x), 1, len(self.nodes), dynamics.num_inputs)
         steps = Steps(dynamics, x, u, x.new_tensor([h]))
-        return self._code(dynamics).find(steps)
-
-    def _code(self, dynamics: Dynamics) -> Compiled:
-        if self._compiled is None:
-            self._compiled = Compiled(dynamics)
-        return self._compiled
+        self._compiled = self._compiled or Compiled(dynamics)
+        return self._compiled.find(steps)
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         fits = start.dtype == torch.float64 and start.is_cpu and not torch.is_grad_enabled()
@@ -71,7 +67,7 @@ class CLoop(Wrapped):
 
         u, lengths = next(self.blocks(grid, signal, STATES))
         steps = Steps(cast(nn.Module, dynamics), x, rows(u), lengths)
-        code = self._code(dynamics)
+        code = self._compiled = self._compiled or Compiled(dynamics)
         loop = code.find(steps)
         if loop is None:
             with code.in_python(steps):
