@@ -82,9 +82,8 @@ class UrdfFile:
     def _by_name(self, kind: str, mistakes: list[str]) -> dict[str, ET.Element]:
         elements = self.robot.findall(kind)
         by_name = {element.get("name", ""): element for element in elements}
-        if len(by_name) != len(elements):
-            counts = Counter(element.get("name", "") for element in elements)
-            double = [name for name, count in counts.items() if count > 1]
+        counts = Counter(element.get("name", "") for element in elements)
+        if double := [name for name, count in counts.items() if count > 1]:
             mistakes.append(f"several {kind}s have the same name: {double}")
         if not elements:
             mistakes.append(f"there is no <{kind}>, expected a <robot> with links and joints")
@@ -151,13 +150,11 @@ class UrdfFile:
     def pose(self, name: str, position: float = 0.0) -> np.ndarray:
         """Return the pose of the child link of a joint in its parent link, ``(4, 4)``."""
         motion = np.eye(4)
-        if name not in self.axes:
-            position = 0.0
         if position and self.turns(name):
             motion[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(
                 position * self.axes[name]
             ).as_matrix()
-        elif position:
+        elif position and self.moves(name):
             motion[:3, 3] = position * self.axes[name]
         return self._poses[name] @ motion
 
