@@ -66,6 +66,7 @@ class ModelPlant(Plant):
         self._originals = [*(draws or [model])]
         self._step, self._threads = step, threads
         self._delay = torch.zeros(model.num_inputs) if delay is None else delay
+        self._longest = max(self._delay.tolist(), default=0.0)
         self._copy()
 
     def _copy(self) -> None:
@@ -78,26 +79,27 @@ class ModelPlant(Plant):
     def start(self, q0: Tensor, v0: Tensor) -> None:
         if self._watch.changed():
             self._copy()
-        self._x = self._states(q0, v0, torch.ones(len(q0)).bool())
+        self._x = torch.cat([q0, self._converted("momentum", q0, v0)], dim=-1)
         self._inputs = [q0.new_zeros(len(q0), self.num_inputs)]
         self._loop = self._ready()
 
     def restart(self, chosen: Tensor, q0: Tensor, v0: Tensor) -> None:
         """Set new states ``(k, N)`` of the chosen copies ``(K,)``. Inputs before are zero."""
-        self._x = self._x.clone()
-        self._x[chosen] = self._states(q0, v0, chosen)
+        q, v = (x.clone() for x in self._motion())
+        q[chosen], v[chosen] = q0, v0
+        started = torch.cat([q, self._converted("momentum", q, v)], dim=-1)
+        self._x = torch.where(chosen[:, None], started, self._x)
         self._inputs = [torch.where(chosen[:, None], 0.0, u) for u in self._inputs]
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        longest = max(self._delay.tolist(), default=0.0)
-        self._inputs = [*self._inputs, u][-(math.ceil(longest / duration) + 1) :]
         count = math.ceil(duration / self._step - 1e-6)
         self._loop = self._loop or self._ready()
-        if self._loop is None or longest > 0:
+        if self._loop is None or self._longest > 0:
+            self._inputs = [*self._inputs, u][-(math.ceil(self._longest / duration) + 1) :]
             self._x = self._x + self._path(duration, count)
         else:
             stages = len(self._model.integrator.nodes)
-            inputs = u[:, None, None].expand(-1, count, stages, -1)
+            inputs = u.view(len(self._x), 1, 1, self.num_inputs).expand(-1, count, stages, -1)
             lengths = self._x.new_full((count,), duration / count)
             zero = torch.zeros_like(self._x)
             self._x = self._x + self._loop(zero, self._x, inputs, lengths, self._threads)[:, -1]
@@ -112,86 +114,33 @@ class ModelPlant(Plant):
         times = torch.cat([times, signal.t.clamp(0.0, duration)]).unique()
         increments = torch.empty_like(self._x)
         with torch.no_grad():
-            for rows, model in self._copies():
+            for k, model in enumerate(self._models[: len(self._x)]):
+                rows = slice(k, None, len(self._models))
                 part = signal.with_samples(signal.u[rows])
                 path = path_between(model, model.integrator, self._x[rows], times, part)
                 increments[rows] = path[:, -1]
         return increments
 
-    def _copies(self) -> list[tuple[slice, MechanicalSystem]]:
-        count = len(self._models)
-        return [(slice(k, None, count), x) for k, x in enumerate(self._models[: len(self._x)])]
-
-    def _states(self, q: Tensor, v: Tensor, chosen: Tensor) -> Tensor:
-        """Return the states ``(k, 2N)`` of the chosen copies."""
-        if self._model.state == "qv":
-            return torch.cat([q, v], dim=-1)
-        owner = torch.arange(len(chosen))[chosen] % len(self._models)
-        p = torch.empty_like(v)
-        for k, model in enumerate(self._models):
-            p[owner == k] = model.momentum(q[owner == k], v[owner == k])
-        return torch.cat([q, p], dim=-1)
-
     def _motion(self) -> tuple[Tensor, Tensor]:
-        q, v = self._x.chunk(2, dim=-1)
-        if self._model.state == "qp":
-            p, v = v, torch.empty_like(v)
-            with torch.no_grad():
-                for rows, model in self._copies():
-                    v[rows] = model.velocity(q[rows], p[rows])
-        return q, v
+        q, second = self._x.chunk(2, dim=-1)
+        return q, self._converted("velocity", q, second)
+
+    def _converted(self, function: str, q: Tensor, second: Tensor) -> Tensor:
+        """Return the momentum of v or the velocity of p, ``(K, N)``; v itself in states (q, v)."""
+        if self._model.state == "qv":
+            return second
+        result = torch.empty_like(second)
+        with torch.no_grad():
+            for k, model in enumerate(self._models[: len(q)]):
+                rows = slice(k, None, len(self._models))
+                result[rows] = getattr(model, function)(q[rows], second[rows])
+        return result
 
     def _ready(self) -> Function | None:
         if len(self._models) > 1:
             return None
         integrator = cast(CLoop, self._model.integrator)
         return integrator.ready(self._model, self._x, self._step)
-
-
-class _Setup:
-    """The robot, the data and the limits of an environment, see :class:`RobotEnv`."""
-
-    def __init__(
-        self,
-        robot: Run | MechanicalSystem | Plant | str | Path,
-        data: Run | DataSource | None,
-        step: float | None,
-        limits: tuple[Sequence[float] | None, Sequence[float] | None],
-        draws: Sequence[MechanicalSystem] | None = None,
-        threads: int = 1,
-    ):
-        robot = load(robot) if isinstance(robot, (str, Path)) else robot
-        data = robot if data is None and isinstance(robot, Run) else data
-        if data is None:
-            raise TypeError("the robot is not a run, so training data are missing: set data")
-        source = data.source if isinstance(data, Run) else data
-        train = source.load().train
-        sample_time = float(train[0].t[1] - train[0].t[0])
-        self.dt = step or (data.statistics.step if isinstance(data, Run) else sample_time)
-        if isinstance(robot, Run):
-            robot = ModelPlant(
-                robot.system,
-                step=robot.statistics.step,
-                delay=torch.from_numpy(robot.input_delay),
-                draws=draws,
-                threads=threads,
-            )
-        elif isinstance(robot, MechanicalSystem):
-            robot = SystemPlant(double_copy(robot))
-        self.plant: Plant = robot
-        strides = [max(1, len(item.q) // _SAMPLES) for item in train]
-        q = [item.q[::stride].double() for item, stride in zip(train, strides, strict=True)]
-        v = [item.v[::stride].double() for item, stride in zip(train, strides, strict=True)]
-        self.region = DataRegion(q, v, angles=source.angles)
-        self.q, self.v, u = torch.cat(q), torch.cat(v), torch.cat([item.u for item in train])
-        low = np.asarray(u.amin(0) if limits[0] is None else limits[0], dtype=np.float32)
-        high = np.asarray(u.amax(0) if limits[1] is None else limits[1], dtype=np.float32)
-        self.inputs = gymnasium.spaces.Box(low, high)
-
-    def observations(self, has_goal: bool) -> gymnasium.spaces.Box:
-        """Return the space of observations (q, v), or (q, v, goal)."""
-        size = self.q.shape[1] * (3 if has_goal else 2)
-        return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
 
 class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -235,52 +184,41 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         u_low: Sequence[float] | None = None,
         u_high: Sequence[float] | None = None,
     ):
-        setup = _Setup(robot, data, step, (u_low, u_high))
-        self.plant, self.dt, self.region = setup.plant, setup.dt, setup.region
-        self.reward, self.steps = reward, max(1, round(duration / self.dt))
-        self._q, self._v, self.action_space = setup.q, setup.v, setup.inputs
-        self.observation_space = setup.observations(has_goal=reward is None)
+        rewards: Rewards | None = None
+        if reward is not None:
+            rewards = lambda q, v, u: np.array([reward(q[0], v[0], u[0])])  # noqa: E731
+        self._robots = RobotVectorEnv(
+            robot,
+            1,
+            data=data,
+            reward=rewards,
+            step=step,
+            duration=duration,
+            u_low=u_low,
+            u_high=u_high,
+            autoreset=AutoresetMode.DISABLED,
+        )
+        self.plant, self.dt, self.steps = self._robots.plant, self._robots.dt, self._robots.steps
+        self.action_space = self._robots.single_action_space
+        self.observation_space = self._robots.single_observation_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode in a random state of the training data."""
         super().reset(seed=seed)
-        start, goal = self.np_random.integers(len(self._q), size=2)
-        self._goal = self._q[goal].numpy()
-        state = self._q[start : start + 1], self._v[start : start + 1]
-        self.plant.start(*state)
-        self._state = np.concatenate([x[0].numpy() for x in state])
-        self._count = 0
-        return self._observation(), self._info()
+        self._robots.np_random = self.np_random
+        observations, _ = self._robots.reset()
+        return observations[0], self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold an input ``(M,)``, clipped to its limits, for a step."""
-        u = _clipped(action, self.action_space)
-        motion = self.plant.advance(torch.from_numpy(u)[None], self.dt)
-        state = np.concatenate([x[0].numpy() for x in motion])
-        diverged = not np.isfinite(state).all()
-        self._state = self._state if diverged else state
-        self._count += 1
-        q, v = self._motion()
-        error = q - self._goal
-        reward = float(-error @ error if self.reward is None else self.reward(q, v, u))
-        if diverged:
-            reward *= self.steps - self._count + 1
-        is_over = self._count >= self.steps
-        return self._observation(), reward, diverged, is_over, self._info()
-
-    def _motion(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return q and v, ``(N,)`` each."""
-        size = len(self._goal)
-        return self._state[:size], self._state[size:]
-
-    def _observation(self) -> np.ndarray:
-        parts = [self._state, self._goal] if self.reward is None else [self._state]
-        return np.concatenate(parts)
+        seen, rewards, terminated, truncated, _ = self._robots.step(np.asarray(action)[None])
+        return seen[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info()
 
     def _info(self) -> dict[str, Any]:
-        return {"distance": self.region.distance_of_state(*self._motion())}
+        q, v = self._robots._q[0], self._robots._v[0]
+        return {"distance": self._robots.region.distance_of_state(q, v)}
 
 
 class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -294,7 +232,8 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     distances from the training data.
 
     Args:
-        robot: a run or its folder, or a :class:`ModelPlant`.
+        robot: a run or its folder, or a :class:`ModelPlant`; for K = 1, any robot of
+            :class:`RobotEnv`.
         num_envs: K.
         data, step, duration, u_low, u_high: see :class:`RobotEnv`.
         reward: rewards of a step for arrays of K robots; None for the distance to a goal.
@@ -309,11 +248,12 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     """
 
     action_space: gymnasium.spaces.Box
+    single_action_space: gymnasium.spaces.Box
     _is_over: np.ndarray
 
     def __init__(
         self,
-        robot: Run | ModelPlant | str | Path,
+        robot: Run | MechanicalSystem | Plant | str | Path,
         num_envs: PositiveInt,
         *,
         data: Run | DataSource | None = None,
@@ -326,25 +266,51 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         threads: PositiveInt = 1,
         autoreset: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ):
-        setup = _Setup(robot, data, step, (u_low, u_high), draws, threads)
-        if not isinstance(setup.plant, ModelPlant):
+        robot = load(robot) if isinstance(robot, (str, Path)) else robot
+        if draws is not None and not isinstance(robot, Run):
+            raise TypeError("draws need a run: pass the draws to the ModelPlant")
+        data = robot if data is None and isinstance(robot, Run) else data
+        if data is None:
+            raise TypeError("the robot is not a run, so training data are missing: set data")
+        source = data.source if isinstance(data, Run) else data
+        train = source.load().train
+        sample_time = float(train[0].t[1] - train[0].t[0])
+        self.dt = step or (data.statistics.step if isinstance(data, Run) else sample_time)
+        if isinstance(robot, Run):
+            robot = ModelPlant(
+                robot.system,
+                step=robot.statistics.step,
+                delay=torch.from_numpy(robot.input_delay),
+                draws=draws,
+                threads=threads,
+            )
+        elif isinstance(robot, MechanicalSystem):
+            robot = SystemPlant(double_copy(robot))
+        if num_envs > 1 and not isinstance(robot, ModelPlant):
             raise TypeError(
                 "RobotVectorEnv needs a run or a ModelPlant: use gymnasium.make_vec for any other "
                 "robot"
             )
-        if draws is not None and isinstance(robot, ModelPlant):
-            raise TypeError("draws need a run: pass the draws to the ModelPlant")
-        self.num_envs, self.plant = num_envs, setup.plant
-        self.dt, self.region = setup.dt, setup.region
-        self.reward, self.steps = reward, max(1, round(duration / self.dt))
-        self._starts = setup.q.numpy(), setup.v.numpy()
-        self.single_action_space = setup.inputs
-        self.single_observation_space = setup.observations(has_goal=reward is None)
-        spaces = gymnasium.vector.utils.batch_space(setup.inputs, num_envs)
+        self.plant: Plant = robot
+        self.num_envs, self.reward = num_envs, reward
+        self.steps = max(1, round(duration / self.dt))
+        strides = [max(1, len(item.q) // _SAMPLES) for item in train]
+        q = [item.q[::stride].double() for item, stride in zip(train, strides, strict=True)]
+        v = [item.v[::stride].double() for item, stride in zip(train, strides, strict=True)]
+        self.region = DataRegion(q, v, angles=source.angles)
+        self._starts = torch.cat(q).numpy(), torch.cat(v).numpy()
+        u = torch.cat([item.u for item in train])
+        low = np.asarray(u.amin(0) if u_low is None else u_low, dtype=np.float32)
+        high = np.asarray(u.amax(0) if u_high is None else u_high, dtype=np.float32)
+        self._ones = np.ones(q[0].shape[1])
+        inputs = self.single_action_space = gymnasium.spaces.Box(low, high)
+        size = (3 if reward is None else 2) * q[0].shape[1]
+        observations = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
+        self.single_observation_space = observations
+        spaces = gymnasium.vector.utils.batch_space(inputs, num_envs)
         self.action_space = cast(gymnasium.spaces.Box, spaces)
-        self.observation_space = gymnasium.vector.utils.batch_space(
-            self.single_observation_space, num_envs
-        )
+        self._low, self._high = (x.astype(float) for x in (low, high))
+        self.observation_space = gymnasium.vector.utils.batch_space(observations, num_envs)
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset)}
 
     def reset(
@@ -376,25 +342,31 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold inputs ``(K, M)``, clipped to their limits, for a step."""
         mode, ended = self.metadata["autoreset_mode"], self._is_over
-        if mode == AutoresetMode.DISABLED and ended.any():
+        has_ended = np.count_nonzero(ended)  # faster than any()
+        if has_ended and mode == AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
                 f"the episodes of {ended.sum()} robots have ended: start them again by "
                 'reset(options={"reset_mask": terminated | truncated})'
             )
-        u = _clipped(actions, self.action_space)
+        if np.shape(actions) != self.action_space.shape:
+            raise ValueError(
+                f"the action has the shape {np.shape(actions)}, expected {self.action_space.shape}"
+            )
+        u = np.minimum(np.maximum(actions, self._low), self._high)
         q, v = (x.numpy() for x in self.plant.advance(torch.from_numpy(u), self.dt))
-        diverged = ~(np.isfinite(q).all(1) & np.isfinite(v).all(1)) & ~ended
-        self._q, self._v = (
-            np.where(diverged[:, None], before, after)
-            for before, after in ((self._q, q), (self._v, v))
-        )
         self._count += 1
+        finite, diverged = np.isfinite(q + v), np.zeros(self.num_envs, dtype=bool)
+        if np.count_nonzero(finite) < finite.size:
+            diverged = ~finite.all(1) & ~ended
+            q, v = (np.where(diverged[:, None], *x) for x in ((self._q, q), (self._v, v)))
+        self._q, self._v = q, v
         if self.reward is None:
-            rewards = -np.square(self._q - self._goal).sum(1)
+            rewards = -np.square(q - self._goal) @ self._ones
         else:
-            rewards = self.reward(self._q, self._v, u)
-        rewards = np.where(diverged, rewards * (self.steps - self._count + 1), rewards)
-        if ended.any():
+            rewards = self.reward(q, v, u)
+        if np.count_nonzero(diverged):
+            rewards = np.where(diverged, rewards * (self.steps - self._count + 1), rewards)
+        if has_ended:
             rewards = np.where(ended, 0.0, rewards)
             self._restart(ended)
         truncated = self._count >= self.steps
@@ -411,9 +383,13 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
         return self.region.distance(torch.from_numpy(self._q), torch.from_numpy(self._v)).numpy()
 
     def _restart(self, ended: np.ndarray) -> None:
+        self._q, self._v = self._q.copy(), self._v.copy()  # views of states of the plant
         self._q[ended], self._v[ended], self._goal[ended] = self._drawn(int(ended.sum()))
         starts = (torch.from_numpy(x[ended]) for x in (self._q, self._v))
-        self.plant.restart(torch.from_numpy(ended), *starts)
+        if isinstance(self.plant, ModelPlant):
+            self.plant.restart(torch.from_numpy(ended), *starts)
+        else:  # a single robot
+            self.plant.start(*starts)
         self._count[ended] = 0
 
     def _drawn(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -425,13 +401,6 @@ class RobotVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarr
     def _observations(self) -> np.ndarray:
         parts = [self._q, self._v, self._goal] if self.reward is None else [self._q, self._v]
         return np.concatenate(parts, axis=1)
-
-
-def _clipped(action: np.ndarray, space: gymnasium.spaces.Box) -> np.ndarray:
-    """Return an action clipped to the limits of its space. Raise an error for a wrong shape."""
-    if np.shape(action) != space.shape:
-        raise ValueError(f"the action has the shape {np.shape(action)}, expected {space.shape}")
-    return np.minimum(np.maximum(action, space.low), space.high).astype(float)
 
 
 gymnasium.register("pinn_dyn/Robot-v0", entry_point="pinn_dyn.envs:RobotEnv")

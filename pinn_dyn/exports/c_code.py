@@ -20,11 +20,10 @@ static inline real square(real x) { return x * x; }
 static inline real larger(real a, real b) { return a > b || a != a ? a : b; }
 static inline real smaller(real a, real b) { return a < b || a != a ? a : b; }
 static inline real sign(real x) { return (real)((x > 0) - (x < 0)); }
-static inline real sigmoid(real x) { return 1 / (1 + exp(-x)); }
 """
 """Functions of the code, after a ``typedef`` of real. NaN passes, as in PyTorch."""
 
-_FUNCTIONS = "sqrt exp expm1 log log1p sin cos tan asin acos atan sinh cosh tanh erf floor sigmoid"
+_FUNCTIONS = "sqrt exp expm1 log log1p sin cos tan asin acos atan sinh cosh tanh erf floor"
 _OPERATORS = {"mul": "*", "div": "/", "add": "+", "sub": "-", "gt": ">", "ge": ">=", "lt": "<"}
 _OPERATORS |= {"le": "<=", "eq": "==", "logical_and": "&", "logical_or": "|"}
 ELEMENTWISE = {

@@ -6,9 +6,7 @@ import ctypes
 import hashlib
 import logging
 import os
-import shutil
 import subprocess
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -27,10 +25,6 @@ _FLAGS += ["-D__FAST_MATH__"]  # makes glibc declare exp, tanh and so on of vect
 QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
 """Flags of an optimization with a third of the compilation time of ``-O3``, for a rigid chain with
 sticking joints. The code has 0.7 to 0.8 of the speed (benchmarks/long_rollout.py)."""
-
-_MOST_PROGRAMS = 100  # in the cache folder
-_UNFINISHED = "unfinished-"  # start of the names of folders of running compilations
-_LONGEST = 3600.0  # time of a compilation, s
 
 
 def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
@@ -52,9 +46,7 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     for library in _unchanged(digest, "so"):
         return ctypes.CDLL(str(library))
     is_cache = _is_safe(folder) and os.access(folder, os.W_OK)
-    if is_cache:
-        _remove_unfinished(folder)
-    with TemporaryDirectory(dir=folder if is_cache else None, prefix=_UNFINISHED) as name:
+    with TemporaryDirectory(dir=folder if is_cache else None) as name:
         source = Path(name) / "code.c"
         source.write_text(code)
         compiled = compile_c(compiler, flags, source)
@@ -65,27 +57,18 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     return loaded
 
 
-def _remove_unfinished(folder: Path) -> None:
-    """Delete unfinished compilations of killed processes."""
-    for path in folder.glob(f"{_UNFINISHED}*"):
-        with suppress(OSError):
-            if time.time() - path.stat().st_mtime > _LONGEST:
-                shutil.rmtree(path)
-
-
 def remember(key: str, content: Any) -> None:
     """Store tensors and plain values in the cache folder, for :func:`recall` in later processes."""
     folder = _folder()
     if not _is_safe(folder):
         return
-    with suppress(OSError), TemporaryDirectory(dir=folder, prefix=_UNFINISHED) as name:
+    with suppress(OSError), TemporaryDirectory(dir=folder) as name:
         path = Path(name) / "code.pt"
         torch.save(content, path)
         path.chmod(0o600)
         earlier = [*folder.glob(f"{key}-*.pt")]
-        oldest = sorted(folder.glob("*.pt"), key=lambda x: x.stat().st_mtime)
         os.replace(path, folder / f"{key}-{_sha256(path)}.pt")
-        for old in {*earlier, *oldest[:-_MOST_PROGRAMS]}:
+        for old in earlier:
             old.unlink(missing_ok=True)
 
 
@@ -93,7 +76,6 @@ def recall(key: str) -> Any:
     """Return the content that :func:`remember` has stored, or None."""
     for path in _unchanged(key, "pt"):
         with suppress(Exception):  # of another version of PyTorch
-            os.utime(path)  # the oldest files are deleted
             return torch.load(path, weights_only=True)
     return None
 

@@ -12,11 +12,12 @@ from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.exports.c_code import PRELUDE
+from pinn_dyn.exports.c_file import static_functions
 from pinn_dyn.exports.compiled import STATES, Compiled, Function, Kind, agree, spread_around
 from pinn_dyn.exports.live_numbers import LiveNumbers
 from pinn_dyn.exports.program import Program
 from pinn_dyn.exports.repeated import programs, sharing
-from pinn_dyn.exports.scalar_code import c_function
+from pinn_dyn.exports.scalar_code import c_functions
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator, Wrapped
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
@@ -51,12 +52,8 @@ class CLoop(Wrapped):
         """
         u = x.new_zeros(len(x), 1, len(self.nodes), dynamics.num_inputs)
         steps = Steps(dynamics, x, u, x.new_tensor([h]))
-        return self._code(dynamics).find(steps)
-
-    def _code(self, dynamics: Dynamics) -> Compiled:
-        if self._compiled is None:
-            self._compiled = Compiled(dynamics)
-        return self._compiled
+        self._compiled = self._compiled or Compiled(dynamics)
+        return self._compiled.find(steps)
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         fits = start.dtype == torch.float64 and start.is_cpu and not torch.is_grad_enabled()
@@ -69,7 +66,7 @@ class CLoop(Wrapped):
 
         u, lengths = next(self.blocks(grid, signal, STATES))
         steps = Steps(cast(nn.Module, dynamics), x, rows(u), lengths)
-        code = self._code(dynamics)
+        code = self._compiled = self._compiled or Compiled(dynamics)
         loop = code.find(steps)
         if loop is None:
             with code.in_python(steps):
@@ -149,14 +146,8 @@ class Steps(Kind):
         return programs(_STEP, dynamics.integration_step, step, ["end"])
 
     def text(self, programs: dict[str, Program], numbers: LiveNumbers) -> str:
-        functions = []
         numbers.block = (8, 2) if self._several else numbers.block
-        for name, program in programs.items():
-            parameters = ["values", *program.inputs, *program.outputs]
-            kinds = {"values": "double *", "h": "double "}
-            text = ", ".join(f"{kinds.get(x, 'real *restrict ')}{x}" for x in parameters)
-            lines = c_function(program, numbers).lines
-            functions += [f"static void {name}({text})", "{", *lines, "}"]
+        functions = static_functions(c_functions(programs, numbers), ["double *values"])
         shapes = programs[_STEP].inputs
         sizes = {"size": shapes["start"].numel(), "stages": shapes["inputs"].numel()}
         parts = [SEVERAL] if self._several else [ONE, PRELUDE]
@@ -220,12 +211,10 @@ static inline real square(real x) { return x * x; }
 static inline real larger(real a, real b) { return choose((a > b) | (a != a), a, b); }
 static inline real smaller(real a, real b) { return choose((a < b) | (a != a), a, b); }
 static inline real sign(real x) { return choose(x > 0, 1.0, 0.0) - choose(x < 0, 1.0, 0.0); }
-static inline real sigmoid(real x) { return 1 / (1 + exp(-x)); }
 #define square(x) square(lanes(x))
 #define larger(a, b) larger(lanes(a), lanes(b))
 #define smaller(a, b) smaller(lanes(a), lanes(b))
 #define sign(x) sign(lanes(x))
-#define sigmoid(x) sigmoid(lanes(x))
 """
 _OF_ONE = "sqrt exp expm1 log log1p sin cos tan asin acos atan sinh cosh tanh erf floor fabs"
 _OF_TWO = "atan2 pow fmod"

@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 
 # Elementwise operations with another name in CasADi, and with the same name.
 _NAMES = {"add": "plus", "sub": "minus", "mul": "times", "div": "rdivide", "pow": "power"}
-_NAMES |= {"abs": "fabs", "where": "if_else"}
+_NAMES |= {"abs": "fabs", "where": "if_else", "maximum": "fmax", "minimum": "fmin"}
 _NAMES |= {"logical_not": "logic_not", "logical_and": "logic_and", "logical_or": "logic_or"}
 _SAME = "sqrt exp expm1 log log1p sin cos tan asin acos atan atan2 sinh cosh tanh erf sign floor"
 _NAMES |= {name: name for name in f"{_SAME} lt le gt ge eq".split()}
+_OPERATORS = {"neg": operator.neg, "reciprocal": lambda x: 1 / x}
 
 
 def casadi_function(program: Program, name: str) -> casadi.Function:
@@ -111,7 +112,7 @@ class _CasadiWriter:
             columns = self.ca.reshape(numbers, -1, shape.numel())
             if name == "sum":
                 return self.ca.sum1(columns).T
-            larger = self._larger if name == "amax" else self._smaller
+            larger = self.ca.fmax if name == "amax" else self.ca.fmin
             return functools.reduce(larger, self.ca.vertsplit(columns)).T
         return self._elementwise(node, name, [self._operand(x, shape) for x in arguments])
 
@@ -127,29 +128,12 @@ class _CasadiWriter:
             return self.values[argument]
         return self.values[argument][_flat(_positions(argument).expand(shape))]
 
-    def _larger(self, x: Any, y: Any) -> Any:
-        """Return the larger number, or NaN if a number is NaN, which ``fmax`` ignores."""
-        if_else = self.ca.if_else
-        return if_else(x > y, x, if_else(x <= y, y, x + y))
-
-    def _smaller(self, x: Any, y: Any) -> Any:
-        return -self._larger(-x, -y)
-
     def _elementwise(self, node: fx.Node, name: str, x: list[Any]) -> Any:
-        if name in _NAMES:
-            return getattr(self.ca, _NAMES[name])(*x)
-        match name:
-            case "neg":
-                return -x[0]
-            case "reciprocal":
-                return 1 / x[0]
-            case "sigmoid":
-                return 1 / (1 + self.ca.exp(-x[0]))
-            case "maximum":
-                return self._larger(*x)
-            case "minimum":
-                return self._smaller(*x)
-        raise unsupported(node, "CasADi")
+        if name in _OPERATORS:
+            return _OPERATORS[name](*x)
+        if name not in _NAMES:
+            raise unsupported(node, "CasADi")
+        return getattr(self.ca, _NAMES[name])(*x)
 
 
 def _positions(node: Any) -> Tensor:

@@ -19,10 +19,11 @@ from torch import Tensor
 from pinn_dyn.exports.c_code import PRELUDE
 from pinn_dyn.exports.c_file import find_compiler, static_functions
 from pinn_dyn.exports.c_library import QUICK, load_code, recall, remember
+from pinn_dyn.exports.exported_function import errors_of_rows
 from pinn_dyn.exports.live_numbers import LiveNumbers
 from pinn_dyn.exports.program import Constants, Program
 from pinn_dyn.exports.repeated import programs
-from pinn_dyn.exports.scalar_code import c_function
+from pinn_dyn.exports.scalar_code import c_functions
 from pinn_dyn.exports.watch import Watch
 
 log = logging.getLogger(__name__)
@@ -31,7 +32,6 @@ BUILD_SECONDS = 1.0
 """Processor time in Python after which code is built, s; about the time of building."""
 STATES = 20
 """Number of states at which code is compared with Python before it is used."""
-_MOST = 64
 _TOLERANCE = 1e-9
 
 Function = Callable[..., Tensor]
@@ -65,7 +65,7 @@ class Code(NamedTuple):
         values = []
         for packed, sources in zip(self.constants, self.leaves, strict=True):
             leaves = [x if isinstance(x, Tensor) else tensors[x] for x in sources]
-            values.append(Constants.unpacked(packed, leaves).evaluate())
+            values.append(Constants(leaves, *packed).evaluate())
         constants = torch.cat(values)
         if not torch.equal(constants[self.places], self.numbers):
             return None
@@ -220,7 +220,7 @@ class Compiled:
             leaves.append([addresses.get(_identity(x), x.detach().clone()) for x in item.leaves])
         return Code(
             text,
-            [item.packed() for item in constants],
+            [[item.operations, item.results] for item in constants],
             leaves,
             torch.tensor(numbers.index, dtype=torch.int64),
             torch.tensor([*numbers.fixed], dtype=torch.int64),
@@ -236,8 +236,6 @@ class Compiled:
         function = kind.loaded(load_code(code.text, kind.flags), values)
         if not kind.agrees(function):
             return None
-        if len(_CODES) >= _MOST:
-            _CODES.pop(next(iter(_CODES)))
         _CODES[key] = code
         return function
 
@@ -253,18 +251,9 @@ def _identity(value: Tensor) -> tuple[Any, ...]:
 
 
 def agree(results: Tensor, expected: Tensor) -> bool:
-    """Return true if results ``(K, ...)`` equal the expected results up to rounding.
-
-    Differences are relative to the norm of a row, or to the RMS of all norms if this is larger. If
-    an expected row is not finite, the result must not be finite either.
-    """
-    rows, truth = results.flatten(1), expected.flatten(1)
-    finite = truth.isfinite().all(-1)
-    norms = torch.linalg.vector_norm(truth, dim=-1)
-    typical = norms[finite].square().mean().sqrt() if finite.any() else norms.new_zeros(())
-    error = torch.linalg.vector_norm(rows - truth, dim=-1)
-    close = error <= _TOLERANCE * torch.maximum(norms, typical) + 1e-12
-    return bool(torch.where(finite, close, ~rows.isfinite().all(-1)).all())
+    """Return true if results ``(K, ...)`` equal the expected results up to rounding."""
+    errors, scales = errors_of_rows(results, expected)
+    return bool((errors <= _TOLERANCE * scales + 1e-12).all())
 
 
 def spread_around(rows: Tensor) -> Tensor:
@@ -280,8 +269,6 @@ def spread_around(rows: Tensor) -> Tensor:
 class _Rows(Kind):
     """A function that maps the rows of a tensor independently."""
 
-    flags = QUICK
-
     def __init__(self, name: str, function: Callable[[Tensor], Tensor], rows: Tensor):
         self.name, self._function = name, function
         self._rows = rows.reshape(-1, rows.shape[-1])
@@ -290,17 +277,13 @@ class _Rows(Kind):
         return programs("row", self._function, {"x": self._rows[0]}, ["y"])
 
     def text(self, programs: dict[str, Program], numbers: LiveNumbers) -> str:
-        *parts, (_, program) = programs.items()
-        n, m = program.inputs["x"].numel(), program.outputs["y"].numel()
-        bodies = {name: (part, c_function(part, numbers)) for name, part in parts}
-        lines = c_function(program, numbers).lines
+        functions = static_functions(c_functions(programs, numbers), ["double *values"])
         return _ROWS.format(
             prelude=PRELUDE,
             definitions="\n".join(numbers.definitions()),
-            parts="\n".join(static_functions(bodies, ["const double *values"])),
-            lines="\n".join(lines),
-            n=n,
-            m=m,
+            functions="\n".join(functions),
+            n=programs["row"].inputs["x"].numel(),
+            m=programs["row"].outputs["y"].numel(),
         )
 
     def loaded(self, library: ctypes.CDLL, values: Tensor) -> Function:
@@ -329,12 +312,8 @@ typedef double real;
 {prelude}
 #define VALUES values
 {definitions}
-{parts}
-static void row(const double *values, const real *restrict x, real *restrict y)
-{{
-{lines}
-}}
+{functions}
 int outputs(void) {{ return {m}; }}
-void rows(const double *values, long count, const real *x, real *y)
+void rows(double *values, long count, const real *x, real *y)
 {{ for (; count > 0; count--, x += {n}, y += {m}) row(values, x, y); }}
 """

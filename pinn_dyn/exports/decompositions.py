@@ -196,6 +196,7 @@ DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     _aten.bitwise_or.Tensor: torch.logical_or,
     _aten.constant_pad_nd.default: _padded,
     _aten.relu.default: lambda x: _clamp(x, 0.0),
+    _aten.sigmoid.default: lambda x: (1 + (-x).exp()).reciprocal(),
     _aten.rsqrt.default: lambda x: x.sqrt().reciprocal(),
     _aten.linalg_cross.default: _cross,
     _aten.softplus.default: _softplus,

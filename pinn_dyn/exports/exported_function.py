@@ -6,8 +6,6 @@ import importlib
 import json
 import os
 import re
-import shutil
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -36,7 +34,6 @@ Ranges = Mapping[str, tuple[Tensor, Tensor]]
 TOLERANCES = {"double": 1e-9, "float": 1e-4}
 DTYPES = {"double": np.float64, "float": np.float32}
 STATES = 200
-_TEMPORARY, _DAY = ".export-", 86_400.0  # s
 _WRITERS = {
     ".c": "pinn_dyn.exports.c_file:write_c",
     ".onnx": "pinn_dyn.exports.onnx_file:write_onnx",
@@ -92,8 +89,7 @@ class ExportedFunction:
     def compare(self, call: Call, real: Real) -> None:
         """Compare the function with that of a file with numbers of the type ``real``.
 
-        A difference is relative to the norm of the output at the state, or to the RMS of the norms
-        over all states if this is larger.
+        A difference is relative to the scale in :func:`errors_of_rows`.
 
         Raises:
             RuntimeError: if a difference exceeds the tolerance of the type, the file returns
@@ -108,30 +104,43 @@ class ExportedFunction:
         for output, expected, column in zip(
             self.outputs, zip(*outputs, strict=True), columns, strict=True
         ):
-            values = torch.stack(expected).reshape(len(states), -1).numpy()
+            values = torch.stack(expected).reshape(len(states), -1)
             results = np.reshape(column, values.shape)
-            finite = np.isfinite(values).all(-1)
-            if results.dtype != DTYPES[real] or not finite.any():
+            count = int(values.isfinite().all(-1).sum())
+            if results.dtype != DTYPES[real] or not count:
                 raise RuntimeError(
-                    f"{self.name}: {output} has {finite.sum()} finite values of {len(finite)} and "
-                    f"is {results.dtype} in the file, expected {real}: no file is written; check "
+                    f"{self.name}: {output} has {count} finite values of {len(values)} and is "
+                    f"{results.dtype} in the file, expected {real}: no file is written; check "
                     "the constants of the model and the writer of this format"
                 )
-            norms = np.linalg.norm(values, axis=-1)
-            scale = np.fmax(norms, np.sqrt(np.mean(norms[finite] ** 2)) if finite.any() else 0.0)
-            error = np.linalg.norm(results - values, axis=-1) / np.where(scale > 0, scale, 1)
-            error = np.where(finite, error, np.where(np.isfinite(results).all(-1), np.inf, 0.0))
-            if not (error <= tolerance).all():
-                worst = int(np.argmax(np.nan_to_num(error, nan=np.inf)))
+            errors, scales = errors_of_rows(torch.from_numpy(results), values)
+            if not (errors <= tolerance * scales).all():
+                relative = errors / scales.where(scales > 0, 1.0)
+                worst = int(relative.nan_to_num(torch.inf).argmax())
                 at = ", ".join(
                     f"{name} = {np.round(x.numpy(), 4).tolist()}"
                     for name, x in zip(self.inputs, states[worst], strict=True)
                 )
                 raise RuntimeError(
-                    f"{self.name}: {output} differs from the original by {error[worst]:.1e} "
+                    f"{self.name}: {output} differs from the original by {relative[worst]:.1e} "
                     f"(relative, expected {tolerance:g}) at {at}: no file is written; check the "
                     "condition numbers of M(q) and A(q) there, or export with real='double'"
                 )
+
+
+def errors_of_rows(results: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the norms of the errors of rows ``(K, ...)``, and their scales, ``(K,)`` each.
+
+    A scale is the norm of the expected row, or the RMS of all norms if this is larger. An expected
+    row that is not finite has the error 0 if the result is not finite either, and else infinity.
+    """
+    rows, truth = results.flatten(1), expected.flatten(1)
+    finite = truth.isfinite().all(-1)
+    norms = torch.linalg.vector_norm(torch.where(finite[:, None], truth, 0.0), dim=-1)
+    typical = (norms.square().sum() / finite.sum().clamp_min(1)).sqrt()
+    differences = torch.linalg.vector_norm(rows - truth, dim=-1)
+    broken = torch.where(rows.isfinite().all(-1), torch.inf, 0.0)
+    return torch.where(finite, differences, broken), norms.clamp_min(typical)
 
 
 def write(
@@ -157,11 +166,8 @@ def write(
     path.parent.mkdir(parents=True, exist_ok=True)
     version = importlib.import_module("pinn_dyn").__version__
     text = json.dumps({"pinn_dyn": version, "real": real, **info}, default=listed)
-    for old in path.parent.glob(f"{_TEMPORARY}*"):  # folders of killed programs
-        if time.time() - old.stat().st_mtime > _DAY:
-            shutil.rmtree(old, ignore_errors=True)
     # Write to a temporary folder and move the file: after a failure, the old file is unchanged.
-    with TemporaryDirectory(dir=path.parent, prefix=_TEMPORARY) as folder:
+    with TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
         partial = Path(folder) / path.name
         calls: Calls = getattr(importlib.import_module(module), writer)(
             functions, partial, text, real

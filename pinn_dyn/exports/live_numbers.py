@@ -38,17 +38,17 @@ class LiveNumbers(ConstantArrays):
         start = 0
         for values in (x for program in programs for x in program.stored()):
             self._starts[values.untyped_storage().data_ptr()] = start
+            if not values.dtype.is_floating_point:  # the code contains indices and booleans
+                self.fixed |= enumerate(values.flatten().double().tolist(), start)
             start += values.numel()
 
     def name(self, values: Tensor) -> str:
         if not values.dtype.is_floating_point:
-            self._fix(values)
             return super().name(values)
         return f"(VALUES + {self._place(self._positions(values))})"
 
     def elements(self, values: Tensor) -> list[float | str]:
         if not values.dtype.is_floating_point:
-            self._fix(values)
             return super().elements(values)
         positions = self._positions(values)
         start = self._place(positions)
@@ -60,7 +60,6 @@ class LiveNumbers(ConstantArrays):
 
     def common(self, values: Tensor) -> float | None:
         if not values.dtype.is_floating_point:
-            self._fix(values)
             return super().common(values)
         positions = self._positions(values).tolist()
         numbers = {self._fixed(position) for position in positions}
@@ -82,12 +81,6 @@ class LiveNumbers(ConstantArrays):
             self._places[key] = len(self.index)
             self.index += positions.tolist()
         return self._places[key]
-
-    def _fix(self, values: Tensor) -> None:
-        """Write indices and booleans, which operations on constants may give, into the code."""
-        if values.untyped_storage().data_ptr() in self._starts:
-            positions = self._positions(values).tolist()
-            self.fixed.update(zip(positions, values.flatten().double().tolist(), strict=True))
 
     def _fixed(self, position: int) -> float | None:
         """Return the number at a position if it is 0, 1 or -1."""

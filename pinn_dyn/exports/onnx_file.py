@@ -16,7 +16,7 @@ from pinn_dyn.exports.exported_function import DTYPES, Calls, ExportedFunction, 
 from pinn_dyn.exports.program import MOVES, moved, operation, unsupported
 
 OPSET = 18
-_SAME = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh erf floor sign sigmoid"
+_SAME = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh erf floor sign"
 _SAME += " neg reciprocal abs add sub mul div pow"
 _ELEMENTWISE = {
     **{name: name.capitalize() for name in _SAME.split()},

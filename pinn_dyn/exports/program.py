@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import operator
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +36,7 @@ class Constants:
 
     Attributes:
         leaves: tensors that the operations read.
-        operations: functions in :data:`torch.ops.aten`, with arguments and options. The argument
+        operations: names of operations of PyTorch, with arguments and options. The argument
             ``"%k"`` is leaf k, or, after the last leaf, the result of an operation.
         results: indices of the leaves and results that the program reads.
     """
@@ -49,25 +50,14 @@ class Constants:
         """Return all numbers that the program reads in a row, ``(n,)``, float64."""
         values: list[Any] = [*self.leaves]
         with torch.no_grad():
-            for function, arguments, options in self.operations:
+            for name, arguments, options in self.operations:
+                function = _function(name)
                 values.append(function(*_replaced(arguments, values), **_replaced(options, values)))
             arrays = [values[k].detach().flatten().double() for k in self.results]
         return torch.cat([torch.zeros(0, dtype=torch.float64), *arrays])
 
-    def packed(self) -> list[Any]:
-        """Return the operations and results without the leaves, as plain values."""
-        names = [getattr(item[0], "name", lambda: "getitem")() for item in self.operations]
-        steps = [[name, *item[1:]] for name, item in zip(names, self.operations, strict=True)]
-        return [steps, self.results]
 
-    @classmethod
-    def unpacked(cls, packed: Sequence[Any], leaves: Sequence[Tensor]) -> Constants:
-        """Return the constants of :meth:`packed` operations with other leaves."""
-        steps, results = packed
-        operations = [[_function(name), *arguments] for name, *arguments in steps]
-        return cls(leaves, operations, results)
-
-
+@functools.cache
 def _function(name: str) -> Any:
     """Return an operation of PyTorch by its name, such as ``aten::add.Tensor``."""
     if name == "getitem":
@@ -77,7 +67,9 @@ def _function(name: str) -> Any:
 
 
 def _replaced(item: Any, values: Any) -> Any:
-    """Replace references such as ``"%3"`` in arguments by their values."""
+    """Replace nodes, and references such as ``"%3"``, in arguments by their values."""
+    if isinstance(item, fx.Node):
+        return values[item]
     if isinstance(item, str) and item.startswith("%"):
         return values[int(item[1:])]
     if isinstance(item, (list, tuple)):
@@ -231,11 +223,10 @@ class _Recorder(TorchDispatchMode):
 
     def __init__(self, inputs: Mapping[str, Tensor]):
         super().__init__()
-        self._graph = fx.Graph()
-        self._stored: dict[int, fx.Node] = {}
+        self._graph, self._folded = fx.Graph(), fx.Graph()
         self._nodes: dict[int, fx.Node] = {}
-        self._numbers: dict[int, int] = {}
-        self._constants: list[Tensor | tuple[Any, Any, Any]] = []
+        self._constants: dict[int, fx.Node] = {}
+        self._stored: dict[fx.Node, fx.Node] = {}
         self._kept: list[Any] = []  # keeps tensors alive, since their addresses identify them
         for name, value in inputs.items():
             self._keep(value, self._graph.placeholder(name))
@@ -252,7 +243,8 @@ class _Recorder(TorchDispatchMode):
             return function(*args, **options)
         if not any(id(x) in self._nodes for x in tree_leaves((args, options))):
             result = function(*args, **options)
-            self._fold(function, args, options, result)
+            if all(isinstance(x, Tensor) for x in tree_leaves(result)):
+                self._record(self._folded, function, args, options, result)
             return result
         for rule in (_RULES.get(function), function.decompose):
             if rule is not None:
@@ -261,106 +253,86 @@ class _Recorder(TorchDispatchMode):
                 if result is not NotImplemented:
                     return result
         result = function(*args, **options)
-        self._record(function, args, options, result)
-        return result
-
-    def _record(self, function: Any, args: Any, options: Any, result: Any) -> None:
-        """Record an operation on an input."""
         if function in _OF_SHAPES_ALONE:
             self._leaf(result)
-            return
+            return result
         if function is torch.ops.aten.squeeze_.dim:
             function = torch.ops.aten.squeeze.dim
         values = tree_leaves(result)
         if function._schema.is_mutable or not all(isinstance(x, Tensor) for x in values):
             raise TypeError(f"{function} on a number that depends on an input cannot be recorded")
-        arguments, named = tree_map(self._operand, (tuple(args), dict(options)))
-        node = self._graph.call_function(function, arguments, named)
+        node = self._record(self._graph, function, args, options, result)
         node.meta["line"] = _line_of_code()
+        return result
+
+    def _record(
+        self, graph: fx.Graph, function: Any, args: Any, options: Any, result: Any
+    ) -> fx.Node:
+        """Record an operation on inputs, or on constants."""
+        operand = functools.partial(self._operand, graph)
+        node = graph.call_function(function, *tree_map(operand, (tuple(args), dict(options))))
         if isinstance(result, Tensor):
             self._keep(result, node)
-            return
+            return node
         node.meta["val"] = result
         for k, value in enumerate(result):
-            self._keep(value, self._graph.call_function(operator.getitem, (node, k)))
+            self._keep(value, graph.call_function(operator.getitem, (node, k)))
+        return node
 
     def _keep(self, value: Tensor, node: fx.Node) -> None:
         self._kept.append(value)
-        self._nodes[id(value)] = node
+        nodes = self._nodes if node.graph is self._graph else self._constants
+        nodes[id(value)] = node
         node.meta["val"] = value.detach()
 
-    def _operand(self, value: Any) -> Any:
-        """Return the node of a tensor."""
+    def _leaf(self, value: Tensor) -> None:
+        self._keep(value, self._folded.get_attr(f"leaf{len(self._kept)}"))
+
+    def _operand(self, graph: fx.Graph, value: Any) -> Any:
+        """Return the node of a tensor in a graph. A tensor without an operation is a leaf."""
         if not isinstance(value, Tensor):
             return value
-        return self._nodes.get(id(value)) or self._stored_node(value)
-
-    def _stored_node(self, value: Tensor) -> fx.Node:
-        number = self._number(value)
-        if number not in self._stored:
-            node = self._graph.get_attr(f"constant_{number}")
-            node.meta["val"] = value.detach().clone().contiguous()
-            self._stored[number] = node
-        return self._stored[number]
-
-    def _fold(self, function: Any, args: Any, options: Any, result: Any) -> None:
-        """Record an operation on constants."""
-        values = tree_leaves(result)
-        if not all(isinstance(x, Tensor) for x in values):
-            return
-        self._add((function, *tree_map(self._reference, (args, options))), result)
-        if not isinstance(result, Tensor):
-            parent = f"%{len(self._constants) - 1}"
-            for k, value in enumerate(result):
-                self._add((operator.getitem, (parent, k), {}), value)
-
-    def _leaf(self, value: Tensor) -> None:
-        self._add(value, value)
-
-    def _reference(self, value: Any) -> Any:
-        return f"%{self._number(value)}" if isinstance(value, Tensor) else value
-
-    def _number(self, value: Tensor) -> int:
-        """Return the index of a constant. A tensor without a recorded operation is a leaf."""
-        if id(value) not in self._numbers:
+        if id(value) in self._nodes:
+            return self._nodes[id(value)]
+        if id(value) not in self._constants:
             self._leaf(value)
-        return self._numbers[id(value)]
-
-    def _add(self, entry: Tensor | tuple[Any, Any, Any], value: Any) -> None:
-        self._kept.append(value)
-        self._numbers[id(value)] = len(self._constants)
-        self._constants.append(entry)
+        constant = self._constants[id(value)]
+        if graph is self._folded:
+            return constant
+        if constant not in self._stored:
+            node = self._stored[constant] = self._graph.get_attr(f"constant{len(self._stored)}")
+            node.meta["val"] = constant.meta["val"].clone().contiguous()
+        return self._stored[constant]
 
     def finished(self, results: Sequence[Tensor]) -> tuple[fx.GraphModule, Constants]:
         """Return the graph with these results, and the computation of its constants."""
-        output = self._graph.output([self._operand(x) for x in results])
+        output = self._graph.output([self._operand(self._graph, x) for x in results])
         output.meta["val"] = [*results]
         self._graph.eliminate_dead_code()
         stored = self._graph.find_nodes(op="get_attr")
-        values = {node.target: node.meta["val"] for node in stored}
-        module = fx.GraphModule(values, self._graph)
-        return module, self._needed([int(x.target.removeprefix("constant_")) for x in stored])
+        module = fx.GraphModule({x.target: x.meta["val"] for x in stored}, self._graph)
+        constants = {x: constant for constant, x in self._stored.items()}
+        read = [constants[x] for x in stored]
+        self._folded.output(read)
+        self._folded.eliminate_dead_code()
+        leaves = self._folded.find_nodes(op="get_attr")
+        calls = [x for x in self._folded.nodes if x.op == "call_function"]
+        index = {x: k for k, x in enumerate([*leaves, *calls])}
+        names = {x: f"%{k}" for x, k in index.items()}
+        operations = [
+            [_name(x.target), _replaced(x.args, names), _replaced(x.kwargs, names)] for x in calls
+        ]
+        tensors = [x.meta["val"] for x in leaves]
+        return module, Constants(tensors, operations, [index[x] for x in read])
 
-    def _needed(self, results: Sequence[int]) -> Constants:
-        """Return the constants from which ``results`` are computed, leaves first."""
-        needed = set(results)
-        for k in reversed(range(len(self._constants))):
-            entry = self._constants[k]
-            if k in needed and not isinstance(entry, Tensor):
-                references = (x for x in tree_leaves(entry[1:]) if isinstance(x, str))
-                needed |= {int(x[1:]) for x in references if x.startswith("%")}
-        entries = {k: self._constants[k] for k in sorted(needed)}
-        leaves = {k: x for k, x in entries.items() if isinstance(x, Tensor)}
-        computed = {k: x for k, x in entries.items() if not isinstance(x, Tensor)}
-        order = {k: position for position, k in enumerate([*leaves, *computed])}
-        names = {k: f"%{position}" for k, position in order.items()}
-        operations = [_replaced(x, names) for x in computed.values()]
-        return Constants([*leaves.values()], operations, [order[k] for k in results])
+
+def _name(function: Any) -> str:
+    return "getitem" if function is operator.getitem else function.name()
 
 
 def _line_of_code() -> str:
     """Return the innermost line of code outside of PyTorch and this package."""
-    frame: FrameType | None = sys._getframe(2)
+    frame: FrameType | None = sys._getframe(1)
     while frame is not None and frame.f_code.co_filename.startswith(_FOLDERS):
         frame = frame.f_back
     if frame is None:

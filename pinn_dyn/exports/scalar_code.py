@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import itertools
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -71,15 +71,6 @@ class ScalarTerms:
         rule = getattr(self, f"_{name}", None)
         return self.term(name, *terms) if rule is None else rule(*terms)
 
-    def _negated(self, term: Term) -> Term | None:
-        """Return x for a term -x, or None for any other term."""
-        name, *operands = self.entries[term]
-        return operands[0] if name == "neg" else None
-
-    def _neg(self, a: Term) -> Term:
-        inner = self._negated(a)
-        return self.term("neg", a) if inner is None else inner
-
     def _mul(self, a: Term, b: Term) -> Term:
         for x, y in ((a, b), (b, a)):
             if self.value(x) == 0:
@@ -88,18 +79,12 @@ class ScalarTerms:
                 return y
             if self.value(x) == -1:
                 return self.apply("neg", y)
-            inner = self._negated(x)
-            if inner is not None:
-                return self.apply("neg", self.apply("mul", inner, y))
         return self.term("mul", *sorted((a, b)))
 
     def _add(self, a: Term, b: Term) -> Term:
         for x, y in ((a, b), (b, a)):
             if self.value(x) == 0:
                 return y
-            inner = self._negated(x)
-            if inner is not None:
-                return self.apply("sub", y, inner)
         return self.term("add", *sorted((a, b)))
 
     def _sub(self, a: Term, b: Term) -> Term:
@@ -107,8 +92,7 @@ class ScalarTerms:
             return a
         if self.value(a) == 0:
             return self.apply("neg", b)
-        inner = self._negated(b)
-        return self.term("sub", a, b) if inner is None else self.apply("add", a, inner)
+        return self.term("sub", a, b)
 
     def _div(self, a: Term, b: Term) -> Term:
         if self.value(a) == 0 or self.value(b) == 1:
@@ -121,25 +105,10 @@ class ScalarTerms:
             return a
         return self.term("where", mask, a, b) if value is None else b
 
-    def _logical_and(self, a: Term, b: Term) -> Term:
-        for x, y in ((a, b), (b, a)):
-            if self.value(x) is not None:
-                return y if self.value(x) else x
-        return self.term("logical_and", a, b)
-
-    def _logical_or(self, a: Term, b: Term) -> Term:
-        for x, y in ((a, b), (b, a)):
-            if self.value(x) is not None:
-                return x if self.value(x) else y
-        return self.term("logical_or", a, b)
-
     def _clone(self, a: Term) -> Term:
         return a
 
     __to_copy = _clone
-
-    def _copy(self, a: Term, b: Term) -> Term:
-        return b
 
     def _pow(self, a: Term, b: Term) -> Term:
         if self.value(b) == 2:
@@ -367,6 +336,13 @@ def c_function(program: Program, constants: ConstantArrays) -> CBody:
     """Return a C function, without loops if the program has no large matrix of learned numbers."""
     kind = ScalarFunction if _is_scalar(program) else CFunction
     return kind(program, constants)
+
+
+def c_functions(
+    programs: Mapping[str, Program], constants: ConstantArrays
+) -> dict[str, tuple[Program, CBody]]:
+    """Return programs and their C functions by name."""
+    return {name: (x, c_function(x, constants)) for name, x in programs.items()}
 
 
 def _is_scalar(program: Program) -> bool:

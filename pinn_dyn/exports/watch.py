@@ -24,6 +24,8 @@ _MEMBERS = {
     property: ("fget",),
     functools.cached_property: ("func",),
     partial: ("func", "args", "keywords"),
+    types.MethodType: ("__self__", "__func__"),
+    **dict.fromkeys((staticmethod, classmethod), ("__func__",)),
 }
 _CLASS = {"__dict__", "__weakref__", "__doc__", "__module__", "_abc_impl", "__annotations__"}
 
@@ -94,9 +96,6 @@ class Watch:
             self._mapping(value)
         elif isinstance(value, (list, tuple, set, frozenset)):
             self._items(value)
-        elif isinstance(value, (staticmethod, classmethod, types.MethodType)):
-            self._visit(getattr(value, "__self__", None))
-            self._visit(value.__func__)
         elif isinstance(value, types.FunctionType):
             self._function(value)
         elif isinstance(value, type):
@@ -173,7 +172,7 @@ class Watch:
             if function.__closure__ is None:
                 return
         else:
-            self._words.append(_instructions(function.__code__))
+            self._words += map(_instructions, _codes(function.__code__))
             self._names(function)
         self._visit(function.__defaults__)
         self._visit(function.__kwdefaults__)
@@ -183,7 +182,7 @@ class Watch:
 
     def _names(self, function: types.FunctionType) -> None:
         """Record the global names that a function of the user reads, also in modules."""
-        names = {*_names_in(function.__code__)}
+        names = {name for code in _codes(function.__code__) for name in code.co_names}
         spaces = [function.__globals__]
         for space in spaces:  # modules are appended during the iteration
             present = sorted(names & space.keys())
@@ -217,18 +216,16 @@ def _content(cell: types.CellType) -> Any:
         return None
 
 
-def _inner(code: types.CodeType) -> list[types.CodeType]:
-    return [x for x in code.co_consts if isinstance(x, types.CodeType)]
+def _codes(code: types.CodeType) -> list[types.CodeType]:
+    """Return the code of a function and of all functions inside it."""
+    inner = [x for x in code.co_consts if isinstance(x, types.CodeType)]
+    return [code, *(y for x in inner for y in _codes(x))]
 
 
 def _instructions(code: types.CodeType) -> Any:
     """Return the instructions of a function, without comments and names of files and lines."""
     numbers = [x for x in code.co_consts if not isinstance(x, types.CodeType)]
-    return code.co_code, code.co_names, repr(numbers), [*map(_instructions, _inner(code))]
-
-
-def _names_in(code: types.CodeType) -> list[str]:
-    return [*code.co_names, *(name for x in _inner(code) for name in _names_in(x))]
+    return code.co_code, code.co_names, repr(numbers)
 
 
 @functools.cache

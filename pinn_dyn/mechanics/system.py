@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, final
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import torch
 from torch import Tensor
@@ -53,6 +53,11 @@ class MechanicalSystem(MechanicalTerms):
 
     A subclass implements the four abstract terms, see :class:`MechanicalTerms`.
     """
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Tensor:
+            """Return a buffer or a parameter."""
 
     @final
     def terms(self, q: Tensor) -> Terms:

@@ -5,33 +5,29 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_MOMENTS = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
+_OF_MATRIX = [0, 1, 4, 2, 5, 8]  # xx, xy, yy, xz, yz and zz of a flattened matrix
+_OF_PARAMETERS = [4, 5, 7, 5, 6, 8, 7, 8, 9]  # the inverse, behind m and m c
 
 
-def pseudo_inertia_basis() -> Tensor:
-    """Return E ``(10, 4, 4)``, float64, with J = sum over a of pi_a E_a.
+def pseudo_inertia(parameters: Tensor) -> Tensor:
+    """Return J ``(*batch, 4, 4)`` of ten parameters ``(*batch, 10)``.
 
     J = [[S, h], [h^T, m]] with h = m c and S the second moments of the mass about the origin,
     S = tr(I) / 2 - I. J is positive definite if and only if the body can have a positive density
     (Wensing, Kim and Slotine 2018, "Linear matrix inequalities for ... inertial parameter
     identification").
     """
-    basis = torch.zeros(10, 4, 4, dtype=torch.float64)
-    basis[0, 3, 3] = 1
-    for k in range(3):
-        basis[1 + k, k, 3] = basis[1 + k, 3, k] = 1
-    for a, (i, j) in enumerate(_MOMENTS, start=4):
-        if i == j:
-            basis[a, :3, :3] = 0.5 * torch.eye(3)
-            basis[a, i, i] -= 1
-        else:
-            basis[a, i, j] = basis[a, j, i] = -1
-    return basis
+    moments = parameters[..., _OF_PARAMETERS].unflatten(-1, (3, 3))
+    half_trace = parameters[..., [4, 6, 9]].sum(-1)[..., None, None] / 2
+    second = half_trace * torch.eye(3).to(parameters) - moments
+    return joined(second, parameters[..., 1:4], parameters[..., 0])
 
 
-def pseudo_inertia(parameters: Tensor) -> Tensor:
-    """Return J ``(*batch, 4, 4)`` of ten parameters ``(*batch, 10)``."""
-    return torch.einsum("...a,aij->...ij", parameters, pseudo_inertia_basis().to(parameters))
+def joined(second: Tensor, first: Tensor, mass: Tensor) -> Tensor:
+    """Return J ``(*batch, 4, 4)`` of S ``(*batch, 3, 3)``, h ``(*batch, 3)`` and m ``(*batch)``."""
+    upper = torch.cat([second, first.unsqueeze(-1)], dim=-1)
+    lower = torch.cat([first, mass.unsqueeze(-1)], dim=-1)
+    return torch.cat([upper, lower.unsqueeze(-2)], dim=-2)
 
 
 def inertial_parameters(pseudo: Tensor) -> Tensor:
@@ -39,9 +35,8 @@ def inertial_parameters(pseudo: Tensor) -> Tensor:
     second = pseudo[..., :3, :3]
     trace = second.diagonal(dim1=-2, dim2=-1).sum(-1)
     moments = trace[..., None, None] * torch.eye(3).to(pseudo) - second
-    columns = [pseudo[..., 3, 3], *pseudo[..., :3, 3].unbind(-1)]
-    columns += [moments[..., i, j] for i, j in _MOMENTS]
-    return torch.stack(columns, dim=-1)
+    columns = [pseudo[..., 3, 3:], pseudo[..., :3, 3], moments.flatten(-2)[..., _OF_MATRIX]]
+    return torch.cat(columns, dim=-1)
 
 
 def rod(start: Tensor, end: Tensor, *, radius: float, density: float) -> Tensor:
@@ -58,11 +53,7 @@ def rod(start: Tensor, end: Tensor, *, radius: float, density: float) -> Tensor:
     parallel = torch.outer(direction, direction)
     across = torch.eye(3, dtype=start.dtype) - parallel
     second = torch.outer(centre, centre) + length**2 / 12 * parallel + radius**2 / 4 * across
-    pseudo = torch.empty(4, 4, dtype=start.dtype)
-    pseudo[:3, :3] = mass * second
-    pseudo[:3, 3] = pseudo[3, :3] = mass * centre
-    pseudo[3, 3] = mass
-    return pseudo
+    return joined(mass * second, mass * centre, mass)
 
 
 def central_parameters(pseudo: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia_basis, rod
+from pinn_dyn.systems.inertia import inertial_parameters, joined, pseudo_inertia, rod
 from pinn_dyn.systems.segment_frames import cross_matrix
 from pinn_dyn.systems.urdf import read_urdf
 
@@ -83,17 +83,6 @@ class RigidChain(MechanicalSystem):
     """
 
     z_is_down = False
-    inertia: Tensor
-    _gravity: Tensor
-    _placements: Tensor
-    _axes: Tensor
-    _turning: Tensor
-    _moved: Tensor
-    _coupling: Tensor
-    _damping: Tensor
-    _screws: Tensor
-    _basis: Tensor
-    _tip_pose: Tensor
 
     def __init__(
         self,
@@ -133,12 +122,10 @@ class RigidChain(MechanicalSystem):
         # for a sliding joint.
         turning = tree.revolute
         axes = torch.where(turning[:, None], tree.axes, 0)
-        cross = torch.zeros(bodies, 4, 4, dtype=double)
-        cross[:, :3, :3] = cross_matrix(axes)
-        slide = torch.zeros(bodies, 4, 4, dtype=double)
-        slide[:, :3, 3] = tree.axes - axes
+        screws = torch.cat([axes, tree.axes - axes], dim=-1)
+        twists = (screws @ _screw_basis().flatten(1)).unflatten(-1, (4, 4))
         start = torch.eye(4, dtype=double).expand(bodies, 4, 4)
-        placements = tree.placements @ torch.stack([start, cross + slide, cross @ cross])
+        placements = tree.placements @ torch.stack([start, twists, twists @ twists])
         # Connectivity: moved[j, k] = 1 if joint j moves body k (Featherstone 2008, sec. 4.1).
         moved = torch.eye(bodies, dtype=double)
         for k, parent in enumerate(tree.parents):
@@ -154,7 +141,7 @@ class RigidChain(MechanicalSystem):
             "_moved": moved,
             "_coupling": tree.coupling,
             "_screws": _screw_basis(),
-            "_basis": pseudo_inertia_basis(),
+            "_basis": pseudo_inertia(torch.eye(10, dtype=double)),
             "_tip_pose": tree.tip_pose,
         }
         for name, value in buffers.items():
@@ -366,9 +353,8 @@ class RigidChain(MechanicalSystem):
         rounding = floor + _ROUNDED * largest
         possible = (masses > 0) & (smallest > -rounding) & (largest < _LARGEST**2)
         sizes = sizes.clamp_min(floor)
-        inertia = torch.ones_like(self.inertia)
-        inertia[:, :3, :3] = axes * sizes.unsqueeze(-2) @ axes.mT + centre @ centre.mT
-        inertia[:, :3, 3:], inertia[:, 3:, :3] = centre, centre.mT
+        second = axes * sizes.unsqueeze(-2) @ axes.mT + centre @ centre.mT
+        inertia = joined(second, centre.squeeze(-1), torch.ones_like(masses))
         return torch.where(possible[:, None, None], mass * inertia, self.generic_inertia())
 
     def tip_position(self, q: Tensor) -> Tensor:

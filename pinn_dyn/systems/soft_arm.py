@@ -59,11 +59,6 @@ class SoftArm(MechanicalSystem):
     """
 
     z_is_down = True
-    mass: Tensor
-    stiffness: Tensor
-    damping: Tensor
-    _s: Tensor
-    _weights: Tensor
 
     def __init__(
         self,
@@ -195,7 +190,6 @@ class SoftArm(MechanicalSystem):
         self, q: Tensor, v: Tensor | None = None, nodes: Tensor | None = None
     ) -> tuple[Tensor, Tensor, list[Tip]]:
         """Return dr/dq ``(*batch, S, 3, N)`` at S points, (d/dt dr/dq) v, and the tip frames."""
-        batch, size = q.shape[:-1], self.num_coordinates
         s = (self._s if nodes is None else nodes).to(q)
         ends = torch.cat([s, s.new_ones(1)])
         base: Tip | None = None
@@ -204,12 +198,8 @@ class SoftArm(MechanicalSystem):
             block = slice(3 * index, 3 * index + 3)
             local_v = None if v is None else v[..., block]
             r, jac, bias, turn, spin, spin_bias = self._segment(q[..., block], local_v, ends)
-            if size > 3:
-                wide = q.new_zeros((*batch, ends.shape[0], 3, size))
-                wide[..., block] = jac
-                wide_spin = q.new_zeros((*batch, 3, size))
-                wide_spin[..., block] = spin
-                jac, spin = wide, wide_spin
+            widths = 3 * index, self.num_coordinates - 3 * index - 3
+            jac, spin = (torch.nn.functional.pad(x, widths) for x in (jac, spin))
             if base is not None:
                 r, jac, bias, turn, spin, spin_bias = in_world(
                     base, v, r, jac, bias, turn, spin, spin_bias

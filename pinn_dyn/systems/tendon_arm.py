@@ -51,10 +51,6 @@ class TendonArm(SoftArm):
     """
 
     input_affine = False
-    friction: Tensor
-    friction_speed: Tensor
-    tendon_stiffness: Tensor
-    routing: Tensor
 
     def __init__(
         self,

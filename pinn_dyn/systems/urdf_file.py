@@ -82,9 +82,8 @@ class UrdfFile:
     def _by_name(self, kind: str, mistakes: list[str]) -> dict[str, ET.Element]:
         elements = self.robot.findall(kind)
         by_name = {element.get("name", ""): element for element in elements}
-        if len(by_name) != len(elements):
-            counts = Counter(element.get("name", "") for element in elements)
-            double = [name for name, count in counts.items() if count > 1]
+        counts = Counter(element.get("name", "") for element in elements)
+        if double := [name for name, count in counts.items() if count > 1]:
             mistakes.append(f"several {kind}s have the same name: {double}")
         if not elements:
             mistakes.append(f"there is no <{kind}>, expected a <robot> with links and joints")
@@ -151,13 +150,11 @@ class UrdfFile:
     def pose(self, name: str, position: float = 0.0) -> np.ndarray:
         """Return the pose of the child link of a joint in its parent link, ``(4, 4)``."""
         motion = np.eye(4)
-        if name not in self.axes:
-            position = 0.0
         if position and self.turns(name):
             motion[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(
                 position * self.axes[name]
             ).as_matrix()
-        elif position:
+        elif position and self.moves(name):
             motion[:3, 3] = position * self.axes[name]
         return self._poses[name] @ motion
 
@@ -258,11 +255,8 @@ def _read(urdf: str) -> tuple[Path, ET.Element]:
         element.tag = element.tag.rpartition("}")[2]
     robot = root if root.tag == "robot" else root.find(".//robot")
     if robot is None:
-        kind, cure = f"XML with the root <{root.tag}>", ""
-        if root.tag == "sdf":
-            convert = f"rosrun pysdf sdf2urdf.py {shlex.quote(str(path))} robot.urdf"
-            kind, cure = "SDF", f": convert it by pysdf, {convert}"
-        raise ValueError(f"{path} is {kind}, expected the URDF or the MJCF of the robot{cure}")
+        kind = f"XML with the root <{root.tag}>"
+        raise ValueError(f"{path} is {kind}, expected the URDF or the MJCF of the robot")
     return path, robot
 
 

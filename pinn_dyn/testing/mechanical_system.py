@@ -212,22 +212,6 @@ class MechanicalSystemContract:
         k = system.implicit_solver(torch.cat([q, second], -1), step)(rate)
         assert_near(k - step * product(jacobian, k), rate, self.exact_tolerance)
 
-    def test_closed_formulas_agree_with_automatic_differentiation(self, system, configurations):
-        q, v, a, _ = configurations
-        arguments: dict[str, tuple[Tensor, ...]] = {
-            "_potential_force": (q,),
-            **dict.fromkeys(("inertial_force", "_acceleration"), (q, v, a)),
-            **dict.fromkeys(("_momentum", "_kinetic_gradient"), (q, v)),
-            **dict.fromkeys(("_hamiltonian_gradient", "_velocity"), (q, a)),
-        }
-        for name, values in arguments.items():
-            actual = getattr(system, name)(*values)
-            expected = getattr(MechanicalSystem, name)(system, *values)
-            if isinstance(actual, tuple):
-                actual, expected = torch.cat(actual), torch.cat(expected)
-            scale = max(1e-12, float(expected.abs().max()))
-            assert_near(actual, expected, self.exact_tolerance, scale)
-
     def test_power_is_the_rate_of_the_total_energy(self, system, configurations):
         q, v, _, u = configurations
         a = system.forward_dynamics(q, v, u)

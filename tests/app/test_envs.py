@@ -101,7 +101,8 @@ def test_the_delay_of_the_data_shifts_the_inputs(lnn_run):
     run = pinn_dyn.load(lnn_run)
     env = RobotEnv(run)
     actions = actions_of(env, 5)
-    env.action_space = gymnasium.spaces.Box(-9, 9, actions[0].shape)
+    limits = [9.0] * actions.shape[1]
+    env = RobotEnv(run, u_low=[-x for x in limits], u_high=limits)
     expected = rolled_out(env, [*np.zeros((2, actions.shape[1])), *actions])
     run.config["dataset"]["delay"] = 2 * env.dt
     delayed = RobotEnv(run)
@@ -264,9 +265,9 @@ def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
                 assert rewards[k] == 0
                 assert (observations[k] != before[k]).reshape(3, -1).any(1).all()  # q, v, goal
                 continue
-            q, v, single._goal = np.split(before[k], 3)
-            single.plant.start(torch.from_numpy(q[None]), torch.from_numpy(v[None]))
-            single._state = np.concatenate([q, v])
+            single.reset()
+            single._robots._q, single._robots._v, single._robots._goal = before[k].reshape(3, 1, -1)
+            single.plant.start(*map(torch.from_numpy, (single._robots._q, single._robots._v)))
             expected, reward, ended, _, info = single.step(actions[k])
             np.testing.assert_allclose(observations[k], expected, rtol=0, atol=1e-10)
             assert rewards[k] == pytest.approx(reward, abs=1e-10)
@@ -329,7 +330,8 @@ def test_episodes_of_a_vector_end_and_start_as_those_of_gymnasium(mode):
 
     def single():
         env = RobotEnv(plant(), **settings)
-        env._q, env._v = env._q[:1], env._v[:1]  # all episodes have the same start and goal
+        starts = tuple(x[:1] for x in env._robots._starts)
+        env._robots._starts = starts  # all episodes have the same start and goal
         return env
 
     ours = RobotVectorEnv(plant(), count, autoreset=mode.value, **settings)

@@ -2,10 +2,8 @@
 
 import json
 import logging
-import os
 import re
 import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -63,9 +61,9 @@ def test_a_step_integrates_as_the_prediction_does(tmp_path):
     torch.testing.assert_close(v_next, model.velocity(end[:3], end[3:]))
 
 
-def assert_refused(tmp_path, message, error=RuntimeError, **options):
-    with pytest.raises(error, match=message):
-        write([SINE], tmp_path / "out" / "f.c", {}, **options)
+def assert_refused(tmp_path, message):
+    with pytest.raises(RuntimeError, match=message):
+        write([SINE], tmp_path / "out" / "f.c", {})
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -80,15 +78,6 @@ def test_code_that_computes_something_else_leaves_no_file(tmp_path, monkeypatch)
 def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
     monkeypatch.setitem(ELEMENTWISE, "sin", "{0} +* 1")
     assert_refused(tmp_path, r"cc does not compile f\.c: .*error")
-
-
-@pytest.mark.parametrize(
-    ("code", "end"), [("{0}; for (;;)", "timed out"), ("*(volatile real *)0 * {0}", "SIGSEGV")]
-)
-def test_code_that_does_not_return_ends_with_a_message(tmp_path, monkeypatch, code, end):
-    monkeypatch.setitem(ELEMENTWISE, "sin", code)
-    monkeypatch.setattr("pinn_dyn.exports.c_file.TIME_LIMIT", 0.5)
-    assert_refused(tmp_path, rf"sine cannot be compared: .*{end}")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -119,28 +108,13 @@ def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
 ):
     monkeypatch.setenv("CC", "/nonexistent")
     path = write([SINE], tmp_path / "f.c", {})
-    assert "f.c was not compared with the model: no C compiler (/nonexistent)" in caplog.text
+    assert "f.c was not compared with the model: no C compiler" in caplog.text
     monkeypatch.setenv("CC", "cc -DUNUSED")
     np.testing.assert_allclose(function_of(path, "f_sine")(0.3), [[np.sin(0.3)]])
     caplog.clear()
     with caplog.at_level(logging.WARNING):
         write([SINE], tmp_path / "f.c", {})
     assert not caplog.text
-
-
-def test_a_compiler_with_an_open_quote_is_named(tmp_path, monkeypatch):
-    monkeypatch.setenv("CC", "gcc -DNAME='a")
-    assert_refused(tmp_path, r"CC is .* expected the command of a C compiler", ValueError)
-
-
-def test_folders_of_exports_that_were_killed_are_removed(tmp_path):
-    """After a day, as another program may still write to a newer one."""
-    for name, age in (("old", 90_000), ("new", 60)):
-        folder = tmp_path / f".export-{name}"
-        folder.mkdir()
-        os.utime(folder, (time.time() - age, time.time() - age))
-    write([SINE], tmp_path / "f.c", {})
-    assert sorted(x.name for x in tmp_path.iterdir()) == [".export-new", "f.c", "f.h"]
 
 
 class Bessel(torch.nn.Module):

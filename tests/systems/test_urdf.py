@@ -62,7 +62,7 @@ WRONG = {
     "SDF": (
         ARM,
         '<sdf version="1.9"><model name="x"/></sdf>',
-        "is SDF, expected the URDF.*: convert it by pysdf",
+        "is XML with the root <sdf>, expected the URDF",
     ),
     "xacro": ("<link", '<x:arm xmlns:x="http://wiki.ros.org/xacro"/><link', "is a xacro file"),
     "a xacro number": ('value="1.5"', 'value="${m}"', "is a xacro file"),
