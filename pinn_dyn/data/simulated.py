@@ -164,10 +164,6 @@ class InitialStates:
     q_high: Sequence[float]
     v_max: Sequence[NonNegativeFloat]
 
-    def __post_init__(self) -> None:
-        if (np.subtract(self.q_high, self.q_low) < 0).any():
-            raise ValueError(f"q_low = {self.q_low} exceeds q_high = {self.q_high}")
-
     def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw ``count`` initial configurations and velocities, both ``(count, N)``."""
         v_max = np.asarray(self.v_max, dtype=float)
@@ -202,7 +198,7 @@ class SimulatedSource(RecordedSource):
         validation, test: number of trajectories.
         seed: seed of all initial states and inputs.
         rtol, atol: tolerances of the solver.
-        compile: compile the equation of motion for the simulation.
+        compile: compile the equation of motion in C for the simulation.
         cache: folder of the cache; ``~`` is the home folder.
         labels: name and unit of each coordinate, N of them.
         input_labels: name and unit of each input, M of them.
@@ -281,12 +277,10 @@ class SimulatedSource(RecordedSource):
 
     def simulate(self) -> Arrays:
         if self.test_duration in (None, self.duration):
-            return self._simulate(SPLITS, self.duration, 0)
-        # Two batches of the same size use the same compiled equation of motion.
-        size = max(len(self._pairs("train")), self.validation + self.test)
-        short = self._simulate(SPLITS[1:], self.test_duration, size)
+            return self._simulate(SPLITS, self.duration)
+        short = self._simulate(SPLITS[1:], self.test_duration)
         # The second simulation has the longer "t".
-        return {**short, **self._simulate(SPLITS[:1], self.duration, size)}
+        return {**short, **self._simulate(SPLITS[:1], self.duration)}
 
     def prove(self, arrays: Arrays) -> np.ndarray:
         q, v, u = (torch.from_numpy(x) for x in spread_samples(arrays))
@@ -297,15 +291,15 @@ class SimulatedSource(RecordedSource):
         inputs = signal(np.linspace(0.0, self.duration, _SAMPLES))
         return np.concatenate([x.ravel() for x in (rates.numpy(), q0, v0, inputs)])
 
-    def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
-        """Simulate the trajectories of some splits in a batch, padded with copies to ``size``."""
+    def _simulate(self, splits: Sequence[str], duration: float) -> Arrays:
+        """Simulate the trajectories of some splits in a batch."""
         t = np.arange(round(duration / self.step) + 1) * self.step
         # A generator per split, so that more test trajectories do not change the training set.
         rngs = {s: np.random.default_rng([self.seed, SPLITS.index(s)]) for s in splits}
         counts = {split: len(self._pairs(split)) for split in splits}
         rows = np.arange(sum(counts.values()))
         record = partial(self._record, rngs, t)
-        motions = [x[: len(rows)] for x in record(np.resize(rows, max(len(rows), size)), draws=1)]
+        motions = record(rows, draws=1)
         if self.q_limits is not None:
             low, high = np.array(self.q_limits, dtype=float)
             self._draw_within_limits(
