@@ -110,8 +110,7 @@ def close_loop(
     queue = deque([controller.first_input.expand(len(q0), -1)] * waiting)
     if sensor is not None:
         sensor.reset()
-    q, v, moving = q0.clone(), v0.clone(), run.running.clone()
-    measured, k = (q.clone(), v.clone()), 0
+    q, v, moving, k = q0.clone(), v0.clone(), run.running.clone(), 0
     pieces: list[tuple[Tensor, float]] = []
     try:
         with (
@@ -128,8 +127,7 @@ def close_loop(
                 for acting, part in pieces:
                     q[moving], v[moving] = plant.advance(acting[moving], part / rate)
                 run.observe(k, q, v)
-                measured = run.measure(k, measured, (q, v) if sensor is None else sensor(q, v))
-                queue.append(run.ask(k, *measured))
+                queue.append(run.ask(k, *((q, v) if sensor is None else sensor(q, v))))
                 u = queue.popleft()
                 run.write("u", k, u)
                 pieces = [(u, share)]
@@ -173,22 +171,14 @@ class _Run:
         beyond = (q.abs() > Q_BOUND).any(-1)
         self.stop(beyond, k, f"the plant diverged: |q| is beyond {Q_BOUND:g}")
 
-    def measure(
-        self, k: int, before: tuple[Tensor, Tensor], now: tuple[Tensor, Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Return the measurement, or the previous one of stopped copies.
+    def ask(self, k: int, q: Tensor, v: Tensor) -> Tensor:
+        """Return the input for a measurement at instant k; it has no meaning for stopped copies.
 
         Copies with a measurement that is not finite are stopped.
         """
-        finite = finite_rows(now[0]) & finite_rows(now[1])
-        self.stop(~finite, k, "the measurement is not finite")
-        running = self.running.unsqueeze(-1)
-        q, v = (torch.where(running, x, y) for x, y in zip(now, before, strict=True))
-        return q, v
-
-    def ask(self, k: int, q: Tensor, v: Tensor) -> Tensor:
-        """Return the input at instant k; it has no meaning for stopped copies."""
-        time = float(self.t[k])
+        self.stop(~(finite_rows(q) & finite_rows(v)), k, "the measurement is not finite")
+        running, time = self.running.unsqueeze(-1), float(self.t[k])
+        q, v = torch.where(running, q, self._like), torch.where(running, v, 0.0)
         motions = [motion_of_copies(self._reference, time + x, q) for x in self._pipeline.ahead]
         motion = motions[0]
         if len(motions) > 1:
@@ -215,11 +205,8 @@ class _Run:
         shape = len(self.t[:: self._stride]), *value.shape[1:]
         if name not in self._columns:
             self._columns[name] = self._like.new_full((len(value), *shape), torch.nan)
-        column = self._columns[name][:, k // self._stride]
-        if self.running.all():
-            column.copy_(value)
-        else:
-            column[self.running] = value[self.running].to(column)
+        stopped = ~self.running.reshape(-1, *[1] * (value.ndim - 1))
+        self._columns[name][:, k // self._stride] = value.masked_fill(stopped, torch.nan)
 
     def record(self, samples: int) -> ClosedLoopRecord:
         """Return the record of the first ``samples`` instants."""

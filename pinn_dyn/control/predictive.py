@@ -63,8 +63,7 @@ class PredictiveControl(Stage):
 
     Raises:
         ImportError: if CasADi is not installed.
-        ValueError: if values do not match N or M, a lower limit exceeds an upper limit, or the
-            horizon is shorter than two steps.
+        ValueError: if values do not match N or M, or the horizon is shorter than two steps.
     """
 
     needs_period, is_python = True, True
@@ -98,9 +97,6 @@ class PredictiveControl(Stage):
         u_max = np.full(m, np.inf) if largest is None else largest.detach().numpy()
         v_high = _row("v_max", v_max, n, np.inf)
         low, high = _row("q_low", q_low, n, -np.inf), _row("q_high", q_high, n, np.inf)
-        if (low > high).any():
-            i = int((low > high).argmax())
-            raise ValueError(f"q_low[{i}] is {low[i]:g}, which exceeds q_high[{i}], {high[i]:g}")
         self.limits = Limits(
             np.concatenate([low, -v_high]),
             np.concatenate([high, v_high]),

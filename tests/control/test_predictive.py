@@ -224,5 +224,3 @@ def test_values_that_do_not_fit_are_named():
         PredictiveControl(pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
     with pytest.raises(ValueError, match="expected at least two steps"):
         PredictiveControl(pendulum(), 0.05, STEP)
-    with pytest.raises(ValueError, match=r"q_low\[0\] is 1, which exceeds q_high\[0\], 0.5"):
-        PredictiveControl(pendulum(), 0.6, STEP, q_low=1.0, q_high=0.5)
