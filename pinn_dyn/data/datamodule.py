@@ -73,20 +73,19 @@ class DynamicsData:
 
     @functools.cached_property
     def _samples(self) -> int:
+        if not isinstance(self.stride, str):
+            return self.stride
+        runs, t = self.splits.train, self.splits.train[0].t
+        sample_time = float(t[1] - t[0])
         if self.stride == "auto":
-            runs = self.splits.train
-            sample_time = float(runs[0].t[1] - runs[0].t[0])
             inputs, motions = [x.u.numpy() for x in runs], [x.q.numpy() for x in runs]
             count = samples_in_step([inputs, motions], sample_time)
             log.info("data.stride=auto is %.4g ms", 1e3 * count * sample_time)
             return count
-        if isinstance(self.stride, str):
-            t = self.splits.train[0].t
-            length = seconds_of("stride", self.stride.removeprefix("about "), "'auto', ")
-            if self.stride.startswith("about "):
-                return max(1, round(length / float(t[1] - t[0])))
-            return samples_of("stride", length, t)
-        return self.stride
+        length = seconds_of("stride", self.stride.removeprefix("about "), "'auto', ")
+        if self.stride.startswith("about "):
+            return max(1, round(length / sample_time))
+        return samples_of("stride", length, t)
 
     @property
     def _window_steps(self) -> int:
