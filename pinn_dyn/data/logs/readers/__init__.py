@@ -12,6 +12,7 @@ A reader of a file with several runs returns a mapping of their names to tables.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -56,7 +57,10 @@ _PACKED = (".zip", ".tar", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst")
 
 
 def _is_bag(path: Path) -> bool:
-    return (path / "metadata.yaml").is_file()
+    """Return true for the folder of a bag with an identifier of its storage, which may be lost."""
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text() if metadata.is_file() else ""
+    return bool(re.search(r"storage_identifier: *[\"']?\w", text))
 
 
 def read_tables(path: Path, request: Request) -> dict[str, Table]:
