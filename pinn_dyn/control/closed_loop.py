@@ -164,7 +164,7 @@ class _Run:
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
         """Record the true state at instant k; stop the copies that have diverged."""
-        finite = finite_rows(q) & finite_rows(v)
+        finite = torch.cat([q, v], dim=-1).isfinite().all(-1)
         self.stop(~finite, k, "the plant diverged: its state is not finite")
         self.write("q", k, q)
         self.write("v", k, v)
@@ -176,7 +176,8 @@ class _Run:
 
         Copies with a measurement that is not finite are stopped.
         """
-        self.stop(~(finite_rows(q) & finite_rows(v)), k, "the measurement is not finite")
+        finite = torch.cat([q, v], dim=-1).isfinite().all(-1)
+        self.stop(~finite, k, "the measurement is not finite")
         running, time = self.running.unsqueeze(-1), float(self.t[k])
         q, v = torch.where(running, q, self._like), torch.where(running, v, 0.0)
         motions = [motion_of_copies(self._reference, time + x, q) for x in self._pipeline.ahead]
@@ -244,11 +245,6 @@ def _check(
             f"the period of the pipeline is {pipeline.period:g} s, expected {1 / rate:g} s, the "
             "period of the loop"
         )
-
-
-def finite_rows(x: Tensor) -> Tensor:
-    """Return true for each row of ``(*batch, n)`` with finite numbers only, ``(*batch,)``."""
-    return x.isfinite().all(-1)
 
 
 def motion_of_copies(reference: Reference, time: float, like: Tensor) -> Motion:
