@@ -96,21 +96,16 @@ class DynamicsData:
 
     @functools.cached_property
     def windows(self) -> Windows:
-        """Training windows.
-
-        Raises:
-            ValueError: if a batch is larger than the number of windows.
-        """
+        """Training windows. The batch size is limited to their number."""
         runs, stride, steps = self.splits.train, self._samples, self._window_steps
         starts = sum(max(len(x.t) - steps * stride, 0) for x in runs)
         count = None if self.pairs == "all" else self.pairs
         if count == "auto":
             samples = sum(len(x.t) for x in runs)
             count = min(max(samples // (steps * stride), _FEWEST_WINDOWS), _MOST_WINDOWS)
-            self.batch_size = min(self.batch_size, count)
         if count is not None and 0 < starts < count:
             log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)
-            count, self.batch_size = starts, min(self.batch_size, starts)
+            count = starts
         windows = draw_windows(
             runs,
             count=count,
@@ -120,10 +115,7 @@ class DynamicsData:
             coverage=self.coverage,
             history=self.history,
         )
-        if self.batch_size > len(windows):
-            raise ValueError(
-                f"batch_size is {self.batch_size}, expected at most the pairs, {len(windows)}"
-            )
+        self.batch_size = min(self.batch_size, len(windows))
         return windows
 
     @property
