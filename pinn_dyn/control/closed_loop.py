@@ -14,7 +14,6 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Motion, Plant, Reference, Stage
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.pipeline import STATUS, Pipeline
-from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.progress import Progress
 
 
@@ -238,8 +237,6 @@ def _check(
     ):
         if sizes != expected:
             raise ValueError(f"{name} has sizes {sizes}, expected {expected} of the plant")
-    require_finite("q0", q0)
-    require_finite("v0", v0)
     if abs(pipeline.period * rate - 1) > 1e-6:
         raise ValueError(
             f"the period of the pipeline is {pipeline.period:g} s, expected {1 / rate:g} s, the "
