@@ -14,7 +14,6 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Motion, Plant, Reference, Stage
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.pipeline import STATUS, Pipeline
-from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.progress import Progress
 
 
@@ -110,8 +109,7 @@ def close_loop(
     queue = deque([controller.first_input.expand(len(q0), -1)] * waiting)
     if sensor is not None:
         sensor.reset()
-    q, v, moving = q0.clone(), v0.clone(), run.running.clone()
-    measured, k = (q.clone(), v.clone()), 0
+    q, v, moving, k = q0.clone(), v0.clone(), run.running.clone(), 0
     pieces: list[tuple[Tensor, float]] = []
     try:
         with (
@@ -128,8 +126,7 @@ def close_loop(
                 for acting, part in pieces:
                     q[moving], v[moving] = plant.advance(acting[moving], part / rate)
                 run.observe(k, q, v)
-                measured = run.measure(k, measured, (q, v) if sensor is None else sensor(q, v))
-                queue.append(run.ask(k, *measured))
+                queue.append(run.ask(k, *((q, v) if sensor is None else sensor(q, v))))
                 u = queue.popleft()
                 run.write("u", k, u)
                 pieces = [(u, share)]
@@ -166,29 +163,22 @@ class _Run:
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
         """Record the true state at instant k; stop the copies that have diverged."""
-        finite = finite_rows(q) & finite_rows(v)
+        finite = torch.cat([q, v], dim=-1).isfinite().all(-1)
         self.stop(~finite, k, "the plant diverged: its state is not finite")
         self.write("q", k, q)
         self.write("v", k, v)
         beyond = (q.abs() > Q_BOUND).any(-1)
         self.stop(beyond, k, f"the plant diverged: |q| is beyond {Q_BOUND:g}")
 
-    def measure(
-        self, k: int, before: tuple[Tensor, Tensor], now: tuple[Tensor, Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Return the measurement, or the previous one of stopped copies.
+    def ask(self, k: int, q: Tensor, v: Tensor) -> Tensor:
+        """Return the input for a measurement at instant k; it has no meaning for stopped copies.
 
         Copies with a measurement that is not finite are stopped.
         """
-        finite = finite_rows(now[0]) & finite_rows(now[1])
+        finite = torch.cat([q, v], dim=-1).isfinite().all(-1)
         self.stop(~finite, k, "the measurement is not finite")
-        running = self.running.unsqueeze(-1)
-        q, v = (torch.where(running, x, y) for x, y in zip(now, before, strict=True))
-        return q, v
-
-    def ask(self, k: int, q: Tensor, v: Tensor) -> Tensor:
-        """Return the input at instant k; it has no meaning for stopped copies."""
-        time = float(self.t[k])
+        running, time = self.running.unsqueeze(-1), float(self.t[k])
+        q, v = torch.where(running, q, self._like), torch.where(running, v, 0.0)
         motions = [motion_of_copies(self._reference, time + x, q) for x in self._pipeline.ahead]
         motion = motions[0]
         if len(motions) > 1:
@@ -215,11 +205,8 @@ class _Run:
         shape = len(self.t[:: self._stride]), *value.shape[1:]
         if name not in self._columns:
             self._columns[name] = self._like.new_full((len(value), *shape), torch.nan)
-        column = self._columns[name][:, k // self._stride]
-        if self.running.all():
-            column.copy_(value)
-        else:
-            column[self.running] = value[self.running].to(column)
+        stopped = ~self.running.reshape(-1, *[1] * (value.ndim - 1))
+        self._columns[name][:, k // self._stride] = value.masked_fill(stopped, torch.nan)
 
     def record(self, samples: int) -> ClosedLoopRecord:
         """Return the record of the first ``samples`` instants."""
@@ -250,18 +237,11 @@ def _check(
     ):
         if sizes != expected:
             raise ValueError(f"{name} has sizes {sizes}, expected {expected} of the plant")
-    require_finite("q0", q0)
-    require_finite("v0", v0)
     if abs(pipeline.period * rate - 1) > 1e-6:
         raise ValueError(
             f"the period of the pipeline is {pipeline.period:g} s, expected {1 / rate:g} s, the "
             "period of the loop"
         )
-
-
-def finite_rows(x: Tensor) -> Tensor:
-    """Return true for each row of ``(*batch, n)`` with finite numbers only, ``(*batch,)``."""
-    return x.isfinite().all(-1)
 
 
 def motion_of_copies(reference: Reference, time: float, like: Tensor) -> Motion:

@@ -74,11 +74,8 @@ def export_law(
         dead_time = None if run is None else run.input_delay
         pipeline = Pipeline(law, period, actuator=actuator, dead_time=dead_time)
     if pipeline.law.is_python:
-        inner: Any = pipeline.law
-        while hasattr(inner, "law"):  # inside an observer or a guard
-            inner = inner.law
         raise TypeError(
-            f"{type(inner).__name__} runs in Python and cannot be exported, expected a law "
+            f"{pipeline.law.about()['law']} runs in Python and cannot be exported, expected a law "
             "such as Tracking or LatentLaw"
         )
     n = pipeline.num_coordinates

@@ -12,7 +12,6 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Motion, Setting, Stage, Step
-from pinn_dyn.control.effects import Actuator
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import CoupledOscillators
 
@@ -74,13 +73,6 @@ class LatentLaw(Stage):
     """
 
     needs_period, predicts = True, True
-    _actuator: Actuator
-    _first_target: Tensor
-    _gain: Tensor
-    _flow: tuple[Tensor, Tensor]
-    _wait: tuple[Tensor, Tensor]
-    _stored: int
-    _sizes: list[int]
 
     def __init__(
         self,
@@ -97,7 +89,6 @@ class LatentLaw(Stage):
             raise TypeError(f"model is a {type(model).__name__}, expected CoupledOscillators")
         super().__init__(model.num_coordinates, model.num_inputs)
         self.model, self.dead_time, self.noise = model, dead_time, noise
-        self._late = dead_time or 0.0
         self.position_gain, self.velocity_gain = float(position_gain), float(velocity_gain)
         self.integral_gain = float(integral_gain)
         self.first_input = first_input
@@ -107,18 +98,21 @@ class LatentLaw(Stage):
 
     def at(self, setting: Setting) -> LatentLaw:
         law: LatentLaw = super().at(setting)
-        period = setting.period
-        law._actuator = setting.actuator
-        law._late = setting.dead_time if self.dead_time is None else self.dead_time
-        law._first_target = self.model.rest(setting.first_input)[0]
-        law._gain, _ = self.observer_gain(period)
-        law._flow = self.model.flow(period / self.model.fixed_step)
-        law._wait = self.model.flow(law._late / self.model.fixed_step)
-        law._stored = int(law._late / period + _ROUNDING) + 1
-        n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
-        law._sizes = [2 * n, N, N, M, n, law._stored * M]
-        law.memory_size = sum(law._sizes)
+        law._set(setting)
         return law
+
+    def _set(self, setting: Setting) -> None:
+        period = setting.period
+        self._actuator = setting.actuator
+        self._late = setting.dead_time if self.dead_time is None else self.dead_time
+        self._first_target = self.model.rest(setting.first_input)[0]
+        self._gain, _ = self.observer_gain(period)
+        self._flow = self.model.flow(period / self.model.fixed_step)
+        self._wait = self.model.flow(self._late / self.model.fixed_step)
+        self._stored = int(self._late / period + _ROUNDING) + 1
+        n, N, M = len(self.model.bias), self.num_coordinates, self.num_inputs
+        self._sizes = [2 * n, N, N, M, n, self._stored * M]
+        self.memory_size = sum(self._sizes)
 
     def start(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the memory at rest under the input u: x, d, q_s, u_d, z_d and past inputs."""

@@ -79,16 +79,12 @@ class MomentumObserver:
             period: T, s.
         """
         n = q.shape[-1]
-        sizes = [1] + [n] * (self.memory_size // n)
-        started, residual, last_momentum, last_force, *last_band = memory.split(sizes, dim=-1)
-        momentum, force = self._momentum_and_force(q, v)
-        modeled = 0.5 * (last_force + force + begin + end)
-        disturbance = (momentum - last_momentum) / period - modeled
-        band = self._friction_band(v)
-        change = self._change(disturbance, residual, period, *_joined(band, last_band))
+        started, residual, last = memory.split([1, n, self.memory_size - 1 - n], dim=-1)
+        terms = self._terms(q, v)
+        disturbance = self._disturbance(terms, last, begin + end, period)
+        change = self._change(residual, period, *disturbance)
         residual = residual + torch.where(started > 0.5, change, 0.0)
-        parts = [torch.ones_like(started), residual, momentum, force, *band]
-        return residual, torch.cat(parts, dim=-1)
+        return residual, torch.cat([torch.ones_like(started), residual, terms], dim=-1)
 
     def observe(
         self, q: Tensor, v: Tensor, u: Tensor, period: float, *, hold: bool = False
@@ -102,48 +98,63 @@ class MomentumObserver:
             hold: true if inputs are held until the next sample, false if they are interpolated.
         """
         before = torch.cat([u[:1], u[:-1]]) if hold else u
+        driven = self.driven(q, v, u)[:-1] + self.driven(q, v, before)[1:]
         chunks = zip(q.split(_CHUNK), v.split(_CHUNK), strict=True)
-        parts = [self._momentum_and_force(*chunk) for chunk in chunks]
-        momentum, force = (torch.cat(x) for x in zip(*parts, strict=True))
-        begin = force + self.driven(q, v, u)
-        end = force + self.driven(q, v, before)
-        disturbance = momentum.diff(dim=0) / period - 0.5 * (begin[:-1] + end[1:])
-        band = self._friction_band(v)
-        ranges = _joined([x[1:] for x in band], [x[:-1] for x in band])
+        terms = torch.cat([self._terms(*chunk) for chunk in chunks])
+        disturbance = self._disturbance(terms[1:], terms[:-1], driven, period)
         residuals = [torch.zeros_like(q[0])]
-        for value, *friction in zip(disturbance, *ranges, strict=True):
-            change = self._change(value, residuals[-1], period, *friction)
-            residuals.append(residuals[-1] + change)
+        for values in zip(*disturbance, strict=True):
+            residuals.append(residuals[-1] + self._change(residuals[-1], period, *values))
         return torch.stack(residuals)
 
-    def _momentum_and_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Return p = M v and the part f of dp/dt without the input: C^T v - G - D v - F.
+    def _terms(self, q: Tensor, v: Tensor) -> Tensor:
+        """Return M v and f = C^T v - G - D v - F, ``(*batch, 2N)``.
 
-        With ``rest``, f does not include the dry friction F.
+        With ``rest``, f does not include the dry friction F, whose smallest and largest value
+        follow, ``(*batch, 4N)``.
         """
         momentum = self.model.momentum(q, v)
         state = torch.cat([q, momentum], dim=-1)
         no_input = q.new_zeros(*q.shape[:-1], self.model.num_inputs)
         force = self.model.momentum_derivative(state, no_input)[..., q.shape[-1] :]
-        return momentum, force if self.rest is None else force + self.model.friction_force(v)
+        if self.rest is None:
+            return torch.cat([momentum, force], dim=-1)
+        force = force + self.model.friction_force(v)
+        forward, resting = (v > 0).to(v), v.abs() < self.rest
+        shares = (torch.where(resting, end, forward) for end in (0.0, 1.0))
+        band = [self.model.sliding_force(v, share) for share in shares]
+        return torch.cat([momentum, force, *band], dim=-1)
 
     def driven(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return the force that the input adds, ``(*batch, N)``."""
         no_input = self.model.applied_force(q, v, torch.zeros_like(u))
         return self.model.applied_force(q, v, u) - no_input
 
-    def _friction_band(self, v: Tensor) -> list[Tensor]:
-        """Return the smallest and largest dry friction at v, ``(*batch, N)``; [] without rest."""
-        if self.rest is None:
-            return []
-        forward, resting = (v > 0).to(v), v.abs() < self.rest
-        shares = (torch.where(resting, end, forward) for end in (0.0, 1.0))
-        return [self.model.sliding_force(v, share) for share in shares]
+    def _disturbance(
+        self, terms: Tensor, last: Tensor, driven: Tensor, period: float | Tensor
+    ) -> tuple[Tensor, ...]:
+        """Return d_k without dry friction, and with ``rest`` the bounds of the dry friction.
+
+        Args:
+            terms, last: :meth:`_terms` at the end and at the start of the period.
+            driven: sum of the forces of the inputs at both times.
+            period: T, s.
+        """
+        n = driven.shape[-1]
+        (momentum, force, *band), (last_momentum, last_force, *last_band) = (
+            x.split(n, dim=-1) for x in (terms, last)
+        )
+        modeled = 0.5 * (last_force + force + driven)
+        disturbance = (momentum - last_momentum) / period - modeled
+        if not band:
+            return (disturbance,)
+        low, high = torch.minimum(band[0], last_band[0]), torch.maximum(band[1], last_band[1])
+        return disturbance, low, high
 
     def _change(
-        self, disturbance: Tensor, residual: Tensor, period: float | Tensor, *friction: Tensor
+        self, residual: Tensor, period: float | Tensor, disturbance: Tensor, *friction: Tensor
     ) -> Tensor:
-        """Return r_k+1 - r_k for d_k without dry friction, and the bounds of dry friction."""
+        """Return r_k+1 - r_k for the results of :meth:`_disturbance`."""
         exponent = -self.bandwidth * period
         gain = -(exponent.expm1() if isinstance(exponent, Tensor) else math.expm1(exponent))
         if friction:
@@ -223,13 +234,6 @@ class DisturbanceObserver(Wrapper):
         A = A.flatten(-2).expand(*q.shape[:-1], -1)
         memory = torch.cat([observed, A, compensation, after], dim=-1)
         return Step(u - compensation, memory, {**report, "compensation": size})
-
-
-def _joined(band: list[Tensor], last_band: list[Tensor]) -> tuple[Tensor, ...]:
-    """Return the smallest and largest friction between two instants; () without bands."""
-    if not band:
-        return ()
-    return torch.minimum(band[0], last_band[0]), torch.maximum(band[1], last_band[1])
 
 
 def rest_speeds(model: MechanicalSystem) -> Tensor | None:

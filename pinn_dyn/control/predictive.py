@@ -63,8 +63,7 @@ class PredictiveControl(Stage):
 
     Raises:
         ImportError: if CasADi is not installed.
-        ValueError: if values do not match N or M, a lower limit exceeds an upper limit, or the
-            horizon is shorter than two steps.
+        ValueError: if values do not match N or M, or the horizon is shorter than two steps.
     """
 
     needs_period, is_python = True, True
@@ -98,9 +97,6 @@ class PredictiveControl(Stage):
         u_max = np.full(m, np.inf) if largest is None else largest.detach().numpy()
         v_high = _row("v_max", v_max, n, np.inf)
         low, high = _row("q_low", q_low, n, -np.inf), _row("q_high", q_high, n, np.inf)
-        if (low > high).any():
-            i = int((low > high).argmax())
-            raise ValueError(f"q_low[{i}] is {low[i]:g}, which exceeds q_high[{i}], {high[i]:g}")
         self.limits = Limits(
             np.concatenate([low, -v_high]),
             np.concatenate([high, v_high]),
@@ -108,8 +104,12 @@ class PredictiveControl(Stage):
             np.minimum(_row("actuator.high", actuator.high, m, np.inf), u_max),
             _row("actuator.rate", actuator.rate, m, np.inf),
         )
+        state_weight = [
+            _row("position_weight", position_weight, n),
+            _row("velocity_weight", velocity_weight, n),
+        ]
         self.weights = Weights(
-            self._state_weight(position_weight, velocity_weight),
+            np.diag(np.sqrt(np.concatenate(state_weight))),
             _row("input_weight", input_weight, m),
             _row("rate_weight", rate_weight, m),
             _LIMIT_WEIGHT,
@@ -122,12 +122,6 @@ class PredictiveControl(Stage):
         self._sizes = [1, 2 * n, n, 1, 1, 2 * n * steps, m * steps]
         self.memory_size = sum(self._sizes)
         self._references: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-
-    def _state_weight(self, position: Weight, velocity: Weight) -> np.ndarray:
-        """Return the factor of Q, see :class:`~.shooting.Weights`."""
-        rows = (("position_weight", position), ("velocity_weight", velocity))
-        values = [_row(name, value, self.num_coordinates) for name, value in rows]
-        return np.diag(np.sqrt(np.concatenate(values)))
 
     def step(
         self, q: Tensor, v: Tensor, reference: Motion, applied: Tensor, memory: Tensor
@@ -161,12 +155,6 @@ class PredictiveControl(Stage):
             torch.from_numpy(np.stack(y)).to(q).reshape(*batch, -1) for y in (inputs, memories)
         )
         return Step(result, after, report)
-
-    def plans(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return states ``(*batch, 2N, S)`` and inputs ``(*batch, M, S)`` of the last plans."""
-        x, u = memory.split(self._sizes, dim=-1)[-2:]
-        sizes = (-1, self.problem.steps)
-        return x.unflatten(-1, sizes), u.unflatten(-1, sizes)
 
     def _require_feasible(self, states: np.ndarray, is_first: np.ndarray) -> None:
         """Raise an error if no plan is feasible from a first state."""

@@ -90,11 +90,7 @@ class ShootingProblem:
 
     def _dynamics(self, z: Tensor) -> Tensor:
         n, m = self.sizes
-
-        def dynamics(z: Tensor) -> Tensor:
-            return self._model.forward_dynamics(*z.split([n, n, m], dim=-1))
-
-        return self._compiled.rows("forward_dynamics", dynamics, z)
+        return self._model.forward_dynamics(*z.split([n, n, m], dim=-1))
 
     def _transcribe(self, ca: Any) -> None:
         (n, m), h, steps = self.sizes, self.step, self.steps
@@ -140,8 +136,9 @@ class ShootingProblem:
 
     def accelerations(self, z: np.ndarray) -> np.ndarray:
         """Return a ``(..., N)`` at the states and inputs z = (q, v, u), ``(..., 2N + M)``."""
+        rows = torch.from_numpy(z)
         with torch.no_grad():
-            return self._dynamics(torch.from_numpy(z)).numpy()
+            return self._compiled.rows("forward_dynamics", self._dynamics, rows).numpy()
 
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """Return da/dz, ``(K, N, 2N + M)``, at K states and inputs, by forward differences.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import glob
 import hashlib
@@ -53,55 +54,50 @@ def load_or_make(
             are stored as ``proof``. If a proof differs by more than rounding, the arrays are made
             again.
     """
-
-    def proven() -> Arrays:
-        arrays = make()
-        return arrays if prove is None else {**arrays, "proof": prove(arrays)}
-
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{cache_key(description)}.npz"
-    if path.exists() and not os.access(folder, os.W_OK):
-        arrays = _read(path)
-        return arrays if _holds(arrays, prove, path) else proven()
-    with FileLock(f"{path}.lock"):
-        if path.exists():
-            try:
-                arrays = _read(path)
-            except Exception as error:  # a damaged archive raises nearly anything
-                log.warning("cache file %s is damaged (%s): it is made again", path, error)
-            else:
-                if _holds(arrays, prove, path):
-                    return arrays
-        # The holder of the lock is the only writer; other files are of killed processes.
-        for partial in folder.glob(f"{glob.escape(path.name)}.*.partial"):
-            partial.unlink(missing_ok=True)
-        arrays = proven()
-        with whole(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+    is_read_only = path.exists() and not os.access(folder, os.W_OK)
+    with contextlib.nullcontext() if is_read_only else FileLock(f"{path}.lock"):
+        stored = _stored(path, prove)
+        if stored is not None:
+            return stored
+        arrays = dict(make())
+        if prove is not None:
+            arrays["proof"] = prove(arrays)
+        if not is_read_only:
+            # The holder of the lock is the only writer; other files are of killed processes.
+            for partial in folder.glob(f"{glob.escape(path.name)}.*.partial"):
+                partial.unlink(missing_ok=True)
+            with whole(path) as partial, partial.open("wb") as file:
+                np.savez(file, allow_pickle=False, **arrays)
     return arrays
 
 
-def _holds(arrays: Arrays, prove: Callable[[Arrays], np.ndarray] | None, path: Path) -> bool:
-    """Return true if stored arrays have the current proof; log a warning if they do not."""
-    if prove is None:
-        return True
-    stored, present = arrays["proof"], prove(arrays)
-    if stored.shape == present.shape:
-        scale = _ROUNDING * np.abs(stored).max(initial=0.0, where=np.isfinite(stored))
-        if np.allclose(present, stored, rtol=_ROUNDING, atol=scale, equal_nan=True):
-            return True
+def _stored(path: Path, prove: Callable[[Arrays], np.ndarray] | None) -> Arrays | None:
+    """Return stored arrays with the current proof; None without such arrays, with a warning."""
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = dict(archive)  # reads each member to its end, where its checksum is
+    except Exception as error:  # a damaged archive raises nearly anything
+        log.warning("cache file %s is damaged (%s): it is made again", path, error)
+        return None
+    if prove is None or _agree(arrays["proof"], prove(arrays)):
+        return arrays
     log.warning(
         "the recording %s differs from the current code of its robot and excitation: "
         "it is made again",
         path,
     )
-    return False
+    return None
 
 
-def _read(path: Path) -> Arrays:
-    # numpy reads each member to its end, where zipfile compares the checksum.
-    with np.load(path, allow_pickle=False) as archive:
-        return dict(archive)
+def _agree(stored: np.ndarray, present: np.ndarray) -> bool:
+    scale = _ROUNDING * np.abs(stored).max(initial=0.0, where=np.isfinite(stored))
+    return stored.shape == present.shape and np.allclose(
+        present, stored, rtol=_ROUNDING, atol=scale, equal_nan=True
+    )
 
 
 _MODULE_ATTRIBUTES = frozenset(vars(torch.nn.Module()))

@@ -73,20 +73,19 @@ class DynamicsData:
 
     @functools.cached_property
     def _samples(self) -> int:
+        if not isinstance(self.stride, str):
+            return self.stride
+        runs, t = self.splits.train, self.splits.train[0].t
+        sample_time = float(t[1] - t[0])
         if self.stride == "auto":
-            runs = self.splits.train
-            sample_time = float(runs[0].t[1] - runs[0].t[0])
             inputs, motions = [x.u.numpy() for x in runs], [x.q.numpy() for x in runs]
             count = samples_in_step([inputs, motions], sample_time)
             log.info("data.stride=auto is %.4g ms", 1e3 * count * sample_time)
             return count
-        if isinstance(self.stride, str):
-            t = self.splits.train[0].t
-            length = seconds_of("stride", self.stride.removeprefix("about "), "'auto', ")
-            if self.stride.startswith("about "):
-                return max(1, round(length / float(t[1] - t[0])))
-            return samples_of("stride", length, t)
-        return self.stride
+        length = seconds_of("stride", self.stride.removeprefix("about "), "'auto', ")
+        if self.stride.startswith("about "):
+            return max(1, round(length / sample_time))
+        return samples_of("stride", length, t)
 
     @property
     def _window_steps(self) -> int:
@@ -97,21 +96,16 @@ class DynamicsData:
 
     @functools.cached_property
     def windows(self) -> Windows:
-        """Training windows.
-
-        Raises:
-            ValueError: if a batch is larger than the number of windows.
-        """
+        """Training windows. The batch size is limited to their number."""
         runs, stride, steps = self.splits.train, self._samples, self._window_steps
         starts = sum(max(len(x.t) - steps * stride, 0) for x in runs)
         count = None if self.pairs == "all" else self.pairs
         if count == "auto":
             samples = sum(len(x.t) for x in runs)
             count = min(max(samples // (steps * stride), _FEWEST_WINDOWS), _MOST_WINDOWS)
-            self.batch_size = min(self.batch_size, count)
         if count is not None and 0 < starts < count:
             log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)
-            count, self.batch_size = starts, min(self.batch_size, starts)
+            count = starts
         windows = draw_windows(
             runs,
             count=count,
@@ -121,10 +115,7 @@ class DynamicsData:
             coverage=self.coverage,
             history=self.history,
         )
-        if self.batch_size > len(windows):
-            raise ValueError(
-                f"batch_size is {self.batch_size}, expected at most the pairs, {len(windows)}"
-            )
+        self.batch_size = min(self.batch_size, len(windows))
         return windows
 
     @property

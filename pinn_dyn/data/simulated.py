@@ -25,9 +25,8 @@ from pinn_dyn.systems import HasDomain
 _VERSION = 4
 # Samples at which a recording is compared with the present robot.
 _SAMPLES = 20
-# Within limits: largest number of further draws of a motion, and draws simulated at once.
+# Within limits: largest number of further draws of a motion.
 _REDRAWS = 39
-_AT_ONCE = 3
 
 Motions = Sequence[np.ndarray] | np.ndarray
 """q, v and u of K motions, ``(K, T, .)`` each."""
@@ -105,29 +104,27 @@ class RecordedSource(DataSource):
         Args:
             motions: all motions, changed in place.
             rows: numbers of the motions to check.
-            record: function from numbers of motions to new motions: one or more draws of each,
-                ordered by draw.
+            record: function from numbers of motions to new motions.
             inside: function from q and v ``(K, T, N)`` to a mask ``(K, N)`` of coordinates that
                 stay within their limits.
             draws: largest number of draws of a motion.
             message: format of the error, with fields for names of coordinates and number of draws.
         """
         q, v, _ = motions
-        left, drawn = rows[~inside(q[rows], v[rows]).all(-1)], 0
-        while left.size and drawn < draws:
+        left = rows[~inside(q[rows], v[rows]).all(-1)]
+        for _ in range(draws):
+            if not left.size:
+                return
             new = record(left)
-            stays = inside(*new[:2]).all(-1).reshape(-1, left.size)
-            drawn += len(stays)
-            replaced = stays.any(0)
-            first = (stays.argmax(0) * left.size + np.arange(left.size))[replaced]
+            stays = inside(*new[:2]).all(-1)
             for old, values in zip(motions, new, strict=True):
-                old[left[replaced]] = values[first]
-            left = left[~replaced]
+                old[left[stays]] = values[stays]
+            left = left[~stays]
         if left.size:
             names = np.array(getattr(self.system, "joint_names", self.labels))
             # Samples after a motion has left the limits are NaN.
             recorded = (np.where(np.isnan(x), x[:, :1], x) for x in new[:2])
-            limited = message.format(", ".join(names[~inside(*recorded).all(0)]), drawn)
+            limited = message.format(", ".join(names[~inside(*recorded).all(0)]), draws)
             raise SimulationError(f"{self.name}: {left.size} {limited}")
 
 
@@ -164,10 +161,6 @@ class InitialStates:
     q_high: Sequence[float]
     v_max: Sequence[NonNegativeFloat]
 
-    def __post_init__(self) -> None:
-        if (np.subtract(self.q_high, self.q_low) < 0).any():
-            raise ValueError(f"q_low = {self.q_low} exceeds q_high = {self.q_high}")
-
     def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw ``count`` initial configurations and velocities, both ``(count, N)``."""
         v_max = np.asarray(self.v_max, dtype=float)
@@ -202,7 +195,7 @@ class SimulatedSource(RecordedSource):
         validation, test: number of trajectories.
         seed: seed of all initial states and inputs.
         rtol, atol: tolerances of the solver.
-        compile: compile the equation of motion for the simulation.
+        compile: compile the equation of motion in C for the simulation.
         cache: folder of the cache; ``~`` is the home folder.
         labels: name and unit of each coordinate, N of them.
         input_labels: name and unit of each input, M of them.
@@ -281,12 +274,10 @@ class SimulatedSource(RecordedSource):
 
     def simulate(self) -> Arrays:
         if self.test_duration in (None, self.duration):
-            return self._simulate(SPLITS, self.duration, 0)
-        # Two batches of the same size use the same compiled equation of motion.
-        size = max(len(self._pairs("train")), self.validation + self.test)
-        short = self._simulate(SPLITS[1:], self.test_duration, size)
+            return self._simulate(SPLITS, self.duration)
+        short = self._simulate(SPLITS[1:], self.test_duration)
         # The second simulation has the longer "t".
-        return {**short, **self._simulate(SPLITS[:1], self.duration, size)}
+        return {**short, **self._simulate(SPLITS[:1], self.duration)}
 
     def prove(self, arrays: Arrays) -> np.ndarray:
         q, v, u = (torch.from_numpy(x) for x in spread_samples(arrays))
@@ -297,21 +288,21 @@ class SimulatedSource(RecordedSource):
         inputs = signal(np.linspace(0.0, self.duration, _SAMPLES))
         return np.concatenate([x.ravel() for x in (rates.numpy(), q0, v0, inputs)])
 
-    def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
-        """Simulate the trajectories of some splits in a batch, padded with copies to ``size``."""
+    def _simulate(self, splits: Sequence[str], duration: float) -> Arrays:
+        """Simulate the trajectories of some splits in a batch."""
         t = np.arange(round(duration / self.step) + 1) * self.step
         # A generator per split, so that more test trajectories do not change the training set.
         rngs = {s: np.random.default_rng([self.seed, SPLITS.index(s)]) for s in splits}
         counts = {split: len(self._pairs(split)) for split in splits}
         rows = np.arange(sum(counts.values()))
         record = partial(self._record, rngs, t)
-        motions = [x[: len(rows)] for x in record(np.resize(rows, max(len(rows), size)), draws=1)]
+        motions = record(rows)
         if self.q_limits is not None:
             low, high = np.array(self.q_limits, dtype=float)
             self._draw_within_limits(
                 motions,
                 rows,
-                partial(record, draws=_AT_ONCE),
+                record,
                 lambda q, v: ((q >= low) & (q <= high)).all(1),
                 draws=_REDRAWS,
                 message=f"of {len(rows)} motions leave q_limits of {{}} in each of {{}} draws",
@@ -343,22 +334,21 @@ class SimulatedSource(RecordedSource):
         return q0, v0, picked_signals(signals, *np.array(rows).T)
 
     def _record(
-        self, rngs: Mapping[str, np.random.Generator], t: np.ndarray, rows: np.ndarray, draws: int
+        self, rngs: Mapping[str, np.random.Generator], t: np.ndarray, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Simulate ``draws`` draws of the motions with the numbers ``rows``, ordered by draw."""
-        q0, v0, signals = zip(*(self._draw(rngs) for _ in range(draws)), strict=True)
-        draw, row = np.repeat(np.arange(draws), len(rows)), np.tile(rows, draws)
-        signal = picked_signals(signals, draw, row)
+        """Draw and simulate the motions with the numbers ``rows``."""
+        q0, v0, drawn = self._draw(rngs)
+        signal = picked_signals([drawn], 0 * rows, rows)
         q, v = simulate(
             self.system,
-            np.stack(q0)[draw, row],
-            np.stack(v0)[draw, row],
+            q0[rows],
+            v0[rows],
             lambda times: signal(times - self.dead_time),
             t,
             rtol=self.rtol,
             atol=self.atol,
             compile=self.compile,
             q_limits=None if self.q_limits is None else np.array(self.q_limits, dtype=float),
-            progress=f"simulating {len(row)} trajectories of {self.name}",
+            progress=f"simulating {len(rows)} trajectories of {self.name}",
         )
         return q, v, signal(t)

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-import shutil
-
 import numpy as np
 import scipy
 import torch
 from torch import Tensor
 
 from pinn_dyn.data.excitation import InputSignal
+from pinn_dyn.exports.compiled import Compiled
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.progress import Progress
 
-log = logging.getLogger(__name__)
-
 # In units of the whole duration: far below any step that a smooth motion needs.
 _SMALLEST_STEP = 1e-7
-
-
-def has_cpp_compiler() -> bool:
-    """Return true if torch.compile finds a compiler for the CPU."""
-    return any(map(shutil.which, ("g++", "clang++", "c++")))
 
 
 class SimulationError(RuntimeError):
@@ -61,7 +52,7 @@ def simulate(
         signal: inputs as a function of time, ``(T,) -> (K, T, M)``; must be smooth.
         t: increasing sample times, ``(T,)``, s.
         rtol, atol: tolerances of the solver.
-        compile: compile the equation of motion first, if there is a C++ compiler.
+        compile: compile the equation of motion, if there is a C compiler, see :class:`Compiled`.
         q_limits: limits of q, ``(2, N)``; samples after a motion has left its limits are NaN.
         progress: name of the task in lines of progress; None logs none.
 
@@ -82,18 +73,17 @@ def simulate(
         return np.asarray(((q < low) | (q > high)).any(-1))
 
     left = outside(x0)
-    equation = system.velocity_derivative
-    if compile and has_cpp_compiler():
-        equation = torch.compile(equation)
-    elif compile:
-        log.warning("no C++ compiler (g++ or clang++) on the path: simulating uncompiled, slower")
+    code = Compiled(system)
+
+    def equation(rows: Tensor) -> Tensor:
+        return system.velocity_derivative(rows[..., :size], rows[..., size:])
 
     def derivative(time: float, flat: np.ndarray) -> np.ndarray:
-        x = torch.from_numpy(np.array(flat.reshape(count, size)))
-        u = torch.from_numpy(signal(np.array([time]))[:, 0])
-        with torch.inference_mode():
-            slope = equation(x, u).numpy()
-        return np.where(left[:, None], 0.0, slope).ravel()
+        u = signal(np.array([time]))[:, 0]
+        rows = torch.from_numpy(np.hstack([flat.reshape(count, size), u]))
+        with torch.no_grad():
+            slope = code.rows("velocity_derivative", equation, rows) if compile else equation(rows)
+        return np.where(left[:, None], 0.0, slope.numpy()).ravel()
 
     def give_up(time: float) -> SimulationError:
         return SimulationError(

@@ -153,13 +153,11 @@ def close_loops(
         plant = SimulatorPlant(robot) if isinstance(robot, Stepped) else SystemPlant(robot)
     records, metrics = {}, {}
     for name, law in laws.items():
-        pipeline = law
-        if isinstance(law, Stage):
-            pipeline = Pipeline(law, 1 / rate, actuator=actuator)
         records[name] = close_one_loop(
-            *(plant, pipeline, reference, q0, v0),
+            *(plant, law, reference, q0, v0),
             duration=duration,
             rate=rate,
+            actuator=actuator if isinstance(law, Stage) else None,
             sensor=sensor,
             dead_time=dead_time,
             samples_rate=samples_rate,

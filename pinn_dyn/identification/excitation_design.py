@@ -27,7 +27,6 @@ _DENSITY = 32  # samples in a period of the fastest sine
 _SIZE = 0.3  # weight of the determinant against the condition number
 _DRAWS, _STARTS = 32, 3
 _BATCH = 8  # motions in memory at once
-_SAMPLES = 4000  # states in memory at once
 _UNLIMITED = 100.0  # Nm, scale of a torque without a limit
 _PLAYED = 1000.0  # Hz, rate at which the limits hold
 
@@ -192,8 +191,7 @@ class _Search:
         limits = self.envelope
         q, v, a = (x[0] for x in self.motion(weights[None], self._basis(t)))
         for _ in range(500):
-            parts = zip(*(x.split(_SAMPLES) for x in (q, v, a)), strict=True)
-            tau = torch.cat([limits.torque_for(*part) for part in parts])
+            tau = limits.torque_for(q, v, a)
             largest = max(float(x.max()) for x in limits.uses(q, v, a, tau).values())
             if largest <= 1 and not limits.depth(q).any():
                 break

@@ -362,7 +362,6 @@ def test_a_built_model_is_trained_and_loaded_by_a_builder(tmp_path):
     ("changes", "message"),
     [
         ({"q": ["bend_x", "bendy"]}, "frame: no column 'bendy', which q .*bend_y"),
-        ({"data": partial(DynamicsData, pairs=8, batch_size=9, stride=1)}, "data: batch_size is 9"),
         ({"validator": partial(RolloutValidator, horizon=5.0)}, "validator: horizon is 5.0 s"),
         ({"steps": 10, "validations": 3}, "trainer.steps is 10, .* set trainer.steps=9"),
         (

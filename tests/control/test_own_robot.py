@@ -1,7 +1,6 @@
 """A user's robot of a few methods: it follows a helix, and steps by itself."""
 
 import numpy as np
-import pytest
 import torch
 
 from pinn_dyn.control import Helix, SimulatorPlant
@@ -71,5 +70,3 @@ def test_a_robot_that_steps_by_itself_is_a_plant():
     q, v = plant.advance(torch.tensor([[1.0], [2.0]], dtype=torch.float64), 0.05)
     torch.testing.assert_close(q[:, 0], torch.tensor([0.05, 0.1], dtype=torch.float64))
     assert v.tolist() == [[5.0], [5.0]]
-    with pytest.raises(TypeError, match="Crane has no simulator"):
-        SimulatorPlant(Crane())

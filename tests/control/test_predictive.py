@@ -82,7 +82,7 @@ def test_with_limits_it_is_the_bounded_least_squares_solution():
     q, v = torch.from_numpy(x).split(2)
     memory, zero = torch.zeros(law.memory_size).double(), torch.zeros(1).double()
     _, memory, _ = law.step(q, v, SetPoint([0.0, 0.0])(0.0), zero, memory)
-    np.testing.assert_allclose(law.plans(memory)[1][0], optimum, atol=1e-4)
+    np.testing.assert_allclose(memory[-steps:], optimum, atol=1e-4)
 
 
 def test_it_respects_the_limits_and_beats_the_clipped_law():
@@ -224,5 +224,3 @@ def test_values_that_do_not_fit_are_named():
         PredictiveControl(pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
     with pytest.raises(ValueError, match="expected at least two steps"):
         PredictiveControl(pendulum(), 0.05, STEP)
-    with pytest.raises(ValueError, match=r"q_low\[0\] is 1, which exceeds q_high\[0\], 0.5"):
-        PredictiveControl(pendulum(), 0.6, STEP, q_low=1.0, q_high=0.5)

@@ -428,9 +428,3 @@ def test_bursts_of_stamps_are_warned_of_and_a_row_clock_repairs_them(tmp_path, a
     assert float(splits.train[0].t[1]) == pytest.approx(0.01, rel=1e-3)
     lost = in_bursts().drop(index=range(300, 360))
     refused(tmp_path, lost, r"RowClock found the stamp .* rows are missing.*SplitGaps", steps=steps)
-
-
-def test_a_packed_file_is_to_be_unpacked(tmp_path):
-    (tmp_path / "run.zip").write_bytes(b"PK")
-    with pytest.raises(LogError, match=r"no reader for '.zip': unpack it, and name the files"):
-        source(tmp_path, files="run.zip").load()

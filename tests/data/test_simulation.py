@@ -9,6 +9,7 @@ from pinn_dyn.data import Mixture, MultiSine, SimulationError, Steps, simulate
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import damped_oscillators
 from tests.support.closed_loops import Vanishing
+from tests.support.code_in_c import build_at_once, codes
 from tests.support.linear import exact_solution_under_sine
 
 ARM_INPUTS = Mixture(
@@ -55,14 +56,22 @@ def test_a_damped_linear_system_follows_the_matrix_exponential(linear, tolerance
     np.testing.assert_allclose(np.hstack([q[0], v[0]]), exact.numpy(), rtol=0, atol=error)
 
 
-def test_without_a_compiler_the_simulation_runs_and_says_so(linear, monkeypatch, caplog):
+def test_without_a_compiler_the_simulation_runs(linear, monkeypatch):
     monkeypatch.setenv("PATH", "")
     q0, v0, t = np.ones((2, 2)), np.zeros((2, 2)), np.linspace(0, 1, 5)
     plain = simulate(linear, q0, v0, constant([1.0], 2), t)
     np.testing.assert_array_equal(
         simulate(linear, q0, v0, constant([1.0], 2), t, compile=True), plain
     )
-    assert "no C++ compiler" in caplog.text
+
+
+def test_code_in_c_gives_the_same_motion(monkeypatch, tmp_path):
+    build_at_once(monkeypatch, tmp_path)
+    arm, t = SoftArm(), np.linspace(0, 0.2, 5)
+    at = arm, np.full((3, 3), 0.1), np.zeros((3, 3)), constant([0.1, 0.2, -1.0], 3), t
+    in_c = simulate(*at, compile=True)
+    assert codes()
+    np.testing.assert_allclose(in_c, simulate(*at), rtol=0, atol=1e-7)
 
 
 def test_the_soft_arm_agrees_with_a_tighter_solve_of_one_trajectory(arm_run):

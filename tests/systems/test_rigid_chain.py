@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.data.simulation import has_cpp_compiler
+from pinn_dyn.run.training.trainer import has_cpp_compiler
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia
 from pinn_dyn.testing import MechanicalSystemContract

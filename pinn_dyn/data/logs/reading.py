@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ class Layout:
         signals: columns of q, v (if measured) and u.
         trajectory: column that names the run of a row, or None.
         long: column that names the joint of a row, or None.
-        request: request for the readers.
+        max_age, sep: see :class:`~pinn_dyn.data.logs.table.Request`.
         repairs: faults that the cleaning repairs.
     """
 
@@ -41,7 +41,8 @@ class Layout:
     signals: Mapping[str, Columns]
     trajectory: str | None
     long: str | None
-    request: Request
+    max_age: float
+    sep: str | None
     repairs: Collection[str]
 
     def read(self, files: Files, root: str, report: Report) -> list[Recording]:
@@ -79,7 +80,11 @@ class Layout:
                 )
             paths[stem] = path
         several = len(paths) > 1
-        request = replace(self.request, partial=several)
+        columns = [x for part in (self.time, *self.signals.values()) for x in part.columns]
+        columns += [] if self.trajectory is None else [self.trajectory]
+        request = Request(
+            next(iter(self.time.columns), ""), columns, self.max_age, self.sep, several
+        )
         tables: dict[str, Table] = {}
         for stem, path in paths.items():
             for run, table in read_tables(path, request).items():
@@ -148,7 +153,7 @@ class Layout:
         # If times decrease, check_clock raises an error below.
         if np.isnan(item.values()).any() and (np.diff(item.t) >= 0).all():
             splits = "gaps" in self.repairs
-            stays = fill(item, self.signals, part, self.request.max_age, report, splits=splits)
+            stays = fill(item, self.signals, part, self.max_age, report, splits=splits)
             rows, item, part = rows[stays], item.rows(stays), part.select(stays)
         if count := rows_before_first_sample(item.q):
             text = f"q jumps after the first {count} rows, before the first measurement"

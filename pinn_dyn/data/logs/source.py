@@ -26,7 +26,7 @@ from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.splits import Part, default_split, fitting, split
 from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.step import Step
-from pinn_dyn.data.logs.table import Request, Table
+from pinn_dyn.data.logs.table import Table
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
 
@@ -120,12 +120,10 @@ class LogSource(DataSource):
         self._signals = {key: columns for key, columns in signals.items() if columns is not None}
         self._check_units()
         self.trajectory = trajectory
-        self.long = long
-        self.max_age = max_age
-        self.sep = sep
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self.delay = delay
-        self._repairs = {fault for step in self.steps.values() for fault in step.repairs}
+        repairs = {fault for step in self.steps.values() for fault in step.repairs}
+        self._layout = Layout(self.time, self._signals, trajectory, long, max_age, sep, repairs)
         if (validation is None) != (test is None):
             raise LogError("set both validation and test, or neither for the default split")
         self.validation: Any = validation and validated(Part, "validation", validation)
@@ -217,13 +215,6 @@ class LogSource(DataSource):
         return [
             (rows, part.raw, part.clean[0]) for (rows, _), part in zip(raws, cleaned, strict=True)
         ]
-
-    @property
-    def _layout(self) -> Layout:
-        columns = [x for part in (self.time, *self._signals.values()) for x in part.columns]
-        columns += [] if self.trajectory is None else [self.trajectory]
-        request = Request(next(iter(self.time.columns), ""), columns, self.max_age, self.sep)
-        return Layout(self.time, self._signals, self.trajectory, self.long, request, self._repairs)
 
     @cached_property
     def _loaded(self) -> _LoadedLog:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +20,6 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.data import LightningData
-from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
 from pinn_dyn.evaluation.metrics import BEST_BY, error_text, validation_error
 from pinn_dyn.mechanics import Predictor
@@ -83,6 +83,11 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
     fewest = -(-between // LONGEST_EPOCH)
     parts = next((n for n in range(fewest, 10 * fewest) if between % n == 0), 1)
     return validations * parts, between // parts, parts
+
+
+def has_cpp_compiler() -> bool:
+    """Return true if torch.compile finds a compiler for the CPU."""
+    return any(map(shutil.which, ("g++", "clang++", "c++")))
 
 
 def compiles(compile: bool | Literal["auto"], steps: int, trainer: Mapping[str, Any]) -> bool:

@@ -12,6 +12,7 @@ A reader of a file with several runs returns a mapping of their names to tables.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -52,11 +53,11 @@ READERS: dict[str, Reader] = {
 """Reader of each suffix. The folder of a ROS 2 bag is read as ``.db3``."""
 
 
-_PACKED = (".zip", ".tar", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst")
-
-
 def _is_bag(path: Path) -> bool:
-    return (path / "metadata.yaml").is_file()
+    """Return true for the folder of a bag with an identifier of its storage, which may be lost."""
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text() if metadata.is_file() else ""
+    return bool(re.search(r"storage_identifier: *[\"']?\w", text))
 
 
 def read_tables(path: Path, request: Request) -> dict[str, Table]:
@@ -67,10 +68,9 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
     """
     suffix = ".db3" if _is_bag(path) else path.suffix.lower().replace(".active", ".bag")
     if suffix not in READERS:
-        cure = f"save the log as one of {', '.join(READERS)}"
-        if suffix in _PACKED:
-            cure = "unpack it, and name the files in it"
-        raise LogError(f"{path}: no reader for {suffix!r}: {cure}")
+        raise LogError(
+            f"{path}: no reader for {suffix!r}: save the log as one of {', '.join(READERS)}"
+        )
     try:
         content = READERS[suffix](path, request)
     except Exception as error:  # a damaged file raises nearly anything

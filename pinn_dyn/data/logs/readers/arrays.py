@@ -102,7 +102,7 @@ def read_torch(path: Path, request: Request) -> dict[str, pd.DataFrame]:
             f"{path} contains Python objects, which are not loaded: save plain tensors, as in "
             "torch.save({'t': t, 'q': q, 'u': u}, path)"
         ) from error
-    return _of_runs(path, request, content)
+    return _of_python(path, request, content)
 
 
 def read_json(path: Path, request: Request) -> dict[str, pd.DataFrame]:
@@ -117,22 +117,13 @@ def read_json(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     prefix, records = _records(content, request.columns)
     frame = pd.json_normalize(records)
     if not isinstance(records, list) or isinstance(frame.get(request.time, [None])[0], list):
-        return _of_runs(path, request, content)
+        return _of_python(path, request, content)
     columns: dict[str, pd.Series] = {}
-    notes = []
     for name, cells in frame.items():
         key = f"{prefix}{name}"
         is_vector = any(isinstance(x, list) for x in cells)
         columns |= vector_columns(key, cells) if is_vector else {key: cells}
-        used = any(x.startswith(key) for x in request.columns)
-        lengths = {len(x) for x in cells if isinstance(x, list)}
-        if used and len(lengths) > 1:
-            notes.append(f"{key!r} has {min(lengths)} to {max(lengths)} entries: others are empty")
-        if used and (count := int(cells.isna().sum())) > 0:
-            notes.append(f"{count} of {len(cells)} records have no {key!r}")
-    table = pd.DataFrame(columns).set_axis(frame.index + 1)
-    table.attrs["notes"] = notes
-    return {"": table}
+    return {"": pd.DataFrame(columns).set_axis(frame.index + 1)}
 
 
 def _records(content: Any, columns: Collection[str], prefix: str = "") -> tuple[str, Any]:
@@ -149,15 +140,11 @@ def _records(content: Any, columns: Collection[str], prefix: str = "") -> tuple[
     return prefix, content
 
 
-def _of_runs(path: Path, request: Request, content: Any) -> dict[str, pd.DataFrame]:
-    """Return the tables of a mapping of arrays, or of a list of such mappings, the runs."""
-    if not isinstance(content, list):
-        return _of_python(path, request, content)
-    tables = [_of_python(path, request, values) for values in content]
-    return {f"{k}{run}": x for k, runs in enumerate(tables) for run, x in runs.items()}
-
-
 def _of_python(path: Path, request: Request, content: Any) -> dict[str, pd.DataFrame]:
+    """Return the tables of an array, of a mapping of arrays, or of a list of such runs."""
+    if isinstance(content, list):
+        tables = [_of_python(path, request, values) for values in content]
+        return {f"{k}{run}": x for k, runs in enumerate(tables) for run, x in runs.items()}
     variables = dict(_nested("", content))
     if "" in variables and not variables[""].dtype.names:
         columns = np.atleast_2d(variables[""]).T

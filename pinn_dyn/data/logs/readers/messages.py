@@ -12,7 +12,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar
 
@@ -45,10 +44,7 @@ def _rosbag(path: Path) -> Iterator[Bag]:
     common = _common_types(path)
     highlevel = optional("rosbags.highlevel", path)
     notes: list[str] = []
-    with (
-        _with_storage(path) as folder,
-        highlevel.AnyReader([folder], default_typestore=common) as reader,
-    ):
+    with highlevel.AnyReader([path], default_typestore=common) as reader:
         _register(reader.typestore, common.fielddefs)
 
         def messages(topics: Sequence[str]) -> Iterator[Message]:
@@ -59,27 +55,6 @@ def _rosbag(path: Path) -> Iterator[Bag]:
                 yield item.topic, item.id, received, reader.deserialize(raw, item.msgtype)
 
         yield Bag({item.topic: item.msgtype for item in reader.connections}, messages, notes)
-
-
-@contextmanager
-def _with_storage(path: Path) -> Iterator[Path]:
-    """Yield the folder of a bag, or a folder of links with corrected metadata.
-
-    The metadata of a reindexed bag may have an empty identifier of the storage.
-    """
-    metadata = path / "metadata.yaml"
-    text = metadata.read_text() if metadata.is_file() else ""
-    empty = re.compile(r"""(storage_identifier:) *(""|'')? *$""", re.MULTILINE)
-    if not empty.search(text):
-        yield path
-        return
-    with TemporaryDirectory(prefix="pinn_dyn-") as folder:
-        for file in path.iterdir():
-            if file != metadata:
-                (Path(folder) / file.name).symlink_to(file.absolute())
-        kind = "mcap" if any(path.glob("*.mcap*")) else "sqlite3"
-        (Path(folder) / metadata.name).write_text(empty.sub(rf"\1 {kind}", text))
-        yield Path(folder)
 
 
 def _up_to_damage(messages: Iterator[_Item], notes: list[str]) -> Iterator[_Item]:

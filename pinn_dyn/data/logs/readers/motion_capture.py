@@ -16,7 +16,8 @@ import csv
 import io
 import re
 from collections.abc import Collection, Sequence
-from itertools import accumulate
+
+import pandas as pd
 
 _SECTION = re.compile(r"(Devices|Events|Joints|Model Outputs|Segments|Trajectories)[,;\t ]*")
 _LENGTHS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
@@ -68,7 +69,8 @@ def _vicon(text: str, requested: Collection[str]) -> tuple[str, float]:
         separator = next((x for x in "\t;," if x in "".join(lines[start + 2 : start + 4])), ",")
         owners, axes = (_cells(x, separator) for x in [*lines, "", ""][start + 2 : start + 4])
         owners += [""] * (len(axes) - len(owners))
-        filled = accumulate(owners[: len(axes)], _latest)
+        markers = pd.Series(owners[: len(axes)], dtype=object)
+        filled = markers.where(markers != "").ffill().fillna("")
         names = [f"{x}:{axis}" if x else axis for x, axis in zip(filled, axes, strict=True)]
         matches = len({*names} & {*requested})
         if matches > best[0]:
@@ -113,10 +115,6 @@ def _with_header(
     above = [""] * header + [_joined(unique, separator), _joined(units, separator)]
     above += [""] * (first - len(above))
     return "\n".join([*above, *lines[first:]])
-
-
-def _latest(last: str, name: str) -> str:
-    return name or last
 
 
 def _joined(cells: Sequence[str], separator: str) -> str:

@@ -104,7 +104,8 @@ def read_text(path: Path, request: Request) -> Table:
     while following:
         text, following = following, next(blocks, "")
         body.add(_BARE_BRACKETS.sub(r'"\g<0>"', text) if brackets else text, last=not following)
-    frame, notes = _with_vectors(body.frame(), names), body.all_notes()
+    frame, notes = body.rows()
+    frame = _with_vectors(frame, names)
     if rate and _FRAME in frame:
         frame, notes = _of_frames(frame, rate, notes)
     units = _units(lines[header + 1 : start], dialect, names)
@@ -180,18 +181,21 @@ class _Body:
                 index_col=False,
             )
 
-    def frame(self) -> pd.DataFrame:
-        """Return all rows. Parsed blocks are released, so that each column is stored once."""
+    def rows(self) -> tuple[pd.DataFrame, list[str]]:
+        """Return all rows, and notes on repairs of the file.
+
+        Parsed blocks are released, so that each column is stored once.
+        """
+        if self._repeats:
+            text = (
+                f"{self._repeats} lines that repeat the header are dropped: a restarted recorder?"
+            )
+            self._notes.insert(0, text)
         columns = {
             k: np.concatenate([part.pop(k) for part in self._parts]) for k in range(self._width)
         }
         index = pd.Index(np.concatenate(self._rows))
-        return pd.DataFrame(columns, index=index, copy=False)
-
-    def all_notes(self) -> list[str]:
-        """Return notes on repairs of the file."""
-        text = f"{self._repeats} lines that repeat the header are dropped: a restarted recorder?"
-        return [text] * bool(self._repeats) + self._notes
+        return pd.DataFrame(columns, index=index, copy=False), self._notes
 
     def _without_end(self, text: str, before: int) -> str:
         """Return the lines without incomplete lines at the end."""
