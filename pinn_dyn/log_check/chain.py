@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,13 @@ import numpy as np
 from pinn_dyn.data.logs import Columns, Measurement
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import Averages
-from pinn_dyn.log_check.equation import Regressor, force_columns, tenths
+from pinn_dyn.log_check.equation import (
+    EquationOfMotionRegression,
+    Regressor,
+    force_columns,
+    solve,
+    tenths,
+)
 
 SIGN = "sign of the input"
 """Name of the measurement that judges the sign of an input."""
@@ -28,7 +35,6 @@ OWN = 7
 """Columns of each joint of its own: offset, spring, rotor, damping, and three of dry friction."""
 _LARGEST = 4  # chain of unknown bodies
 _ROWS = 1500
-_RIDGE = 1e-9
 _WORSE, _TENTHS = 4.0, 0.8  # residual of a reading over that of another; tenths with more
 _EXPLAINS = 0.5  # largest residual of a reading that counts
 _NEGATIVE, _POWER = 0.1, 0.2  # shares of positive inertia and of power of reversed inputs
@@ -109,17 +115,6 @@ def chain_columns(data: Averages, regressor: Regressor) -> np.ndarray:
     return np.concatenate([bodies, own.reshape(len(data), n, -1)], axis=2)
 
 
-def solve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return theta of least squares with columns x ``(R, P)`` and one or more y."""
-    scale = np.sqrt((x**2).mean(axis=0)).clip(min=1e-300)
-    return np.asarray(_solve((x / scale).T @ (x / scale), (x / scale).T @ y).T / scale).T
-
-
-def _solve(normal: np.ndarray, cross: np.ndarray) -> np.ndarray:
-    ridge = _RIDGE * np.trace(normal) / len(normal) + 1e-300
-    return np.asarray(np.linalg.solve(normal + ridge * np.eye(len(normal)), cross))
-
-
 class Readings:
     """Ways to read the inputs of a log, and their residuals in one equation of all joints.
 
@@ -134,8 +129,10 @@ class Readings:
 
     Attributes:
         joints, signs: of each input, ``(H, M)``; the first reading is the log.
+        x, y: columns ``(R, N, P)`` and left sides of each reading, ``(R, N, H)``.
         left: unexplained share of each reading on held-out data, by tenth, ``(B, H)``.
         theta: coefficients, ``(P, H)``.
+        residual: y - x theta, ``(R, N, H)``.
     """
 
     def __init__(self, data: Averages, regressor: Regressor, *, forces: bool):
@@ -148,27 +145,20 @@ class Readings:
         if inputs == n:
             weights = 1 / size
         mask = self.data.moving * weights
-        x = chain_columns(self.data, regressor) * mask[:, :, None]
-        self.scale = np.sqrt((x**2).mean(axis=(0, 1))).clip(min=1e-300)
-        x = x / self.scale
+        self.x = chain_columns(self.data, regressor)
+        columns = (self.x * mask[:, :, None]).reshape(-1, self.x.shape[2])
         if not forces and inputs == n:
-            u = u * _gains(x, u, mask)
-        y = np.zeros((len(u), n, len(self.joints)))
+            u = u * _gains(columns, u, mask)
+        self.y = np.zeros((len(u), n, len(self.joints)))
         for h, (joints, signs) in enumerate(zip(self.joints, self.signs, strict=True)):
-            y[:, joints, h] = u * signs
-        y = y * mask[:, :, None]
-        block = tenths(self.data)
-        parts = [(x[block == b], y[block == b]) for b in np.unique(block)]
-        normal = np.stack([np.einsum("rnp,rnq->pq", a, a, optimize=True) for a, _ in parts])
-        cross = np.stack([np.einsum("rnp,rnh->ph", *part, optimize=True) for part in parts])
-        whole, total = normal.sum(axis=0), cross.sum(axis=0)
-        size = (y**2).mean(axis=(0, 1)).clip(min=1e-300)
-        left = []
-        for (a, b), of_normal, of_cross in zip(parts, normal, cross, strict=True):
-            theta = _solve(whole - of_normal, total - of_cross)
-            left.append(((b - a @ theta) ** 2).mean(axis=(0, 1)) / size)
-        self.left, self.theta = np.array(left), _solve(whole, total) / self.scale[:, None]
-        self.y = y / mask.clip(min=1e-300)[:, :, None]
+            self.y[:, joints, h] = u * signs
+        y = (self.y * mask[:, :, None]).reshape(-1, len(self.joints))
+        block = np.repeat(tenths(self.data), n)
+        regression = EquationOfMotionRegression({"x": columns, "y": y}, block)
+        counts = np.bincount(block)[:, None]
+        self.left = regression.held_out("y", ["x"]) / counts / (y**2).mean(axis=0).clip(min=1e-300)
+        self.theta = regression.fit("y", ["x"]).theta[0]
+        self.residual = self.y - self.x @ self.theta
 
     def likely(self) -> np.ndarray:
         """Return the numbers of the readings whose residual is close to the smallest.
@@ -182,23 +172,22 @@ class Readings:
         far |= (means > _EXPLAINS) & (means.min() < _EXPLAINS)
         return np.flatnonzero(~far)
 
+    @cached_property
+    def inertial(self) -> np.ndarray:
+        """Columns of the diagonal of M(q), ``(R, N, P)``."""
+        units = enumerate(np.eye(self.x.shape[1]))
+        pushed = [(k, replace(self.data, a=self.data.a + unit)) for k, unit in units]
+        columns = [chain_columns(data, self.regressor)[:, k] for k, data in pushed]
+        return np.stack(columns, axis=1) - self.x
+
     def direction(self, h: int) -> float:
         """Return the sign of M(q) where it is clear, -1 if the inputs give no power; 0 if mixed."""
-        data, n = self.data, self.data.q.shape[1]
-        theta = self.theta[: len(self.theta) - OWN * n, h]
-        at_rest = self.regressor(data.q, 0 * data.v, 0 * data.a) @ theta
-        pushed = [
-            self.regressor(data.q, 0 * data.v, 0 * data.a + x)[:, k] @ theta
-            for k, x in enumerate(np.eye(n))
-        ]
-        rotors = self.theta[-OWN * n :, h].reshape(n, OWN)[:, 2]
-        inertia = np.stack(pushed, axis=1) - at_rest + rotors
-        left = self.y[:, :, h] - chain_columns(data, self.regressor) @ self.theta[:, h]
-        noise = 2 * (left * data.moving).std(axis=0)
-        smallest = np.maximum(noise, _NOTICEABLE * self.y[:, :, h].std(axis=0))
-        clear = (inertia * data.a).std(axis=0) > smallest
+        y, inertia = self.y[:, :, h], self.inertial @ self.theta[:, h]
+        noise = 2 * (self.residual[:, :, h] * self.data.moving).std(axis=0)
+        smallest = np.maximum(noise, _NOTICEABLE * y.std(axis=0))
+        clear = (inertia * self.data.a).std(axis=0) > smallest
         positive = (inertia > 0).mean(axis=0)[clear]
-        power = self.y[:, :, h] * data.v
+        power = y * self.data.v
         if (positive > _NEGATIVE).all():
             return 1.0
         low = power.sum() < _POWER * np.abs(power).sum()
@@ -206,19 +195,18 @@ class Readings:
 
     def unexplained(self, h: int) -> np.ndarray:
         """Return the unexplained share of each left side for a reading, ``(N,)``."""
-        left = self.y[:, :, h] - chain_columns(self.data, self.regressor) @ self.theta[:, h]
-        squares = (left**2 * self.data.moving).sum(axis=0)
-        return squares / (self.y[:, :, h] ** 2 * self.data.moving).sum(axis=0).clip(min=1e-300)
+        squares = [
+            ((x[:, :, h] * self.data.moving) ** 2).sum(axis=0) for x in (self.residual, self.y)
+        ]
+        return np.asarray(squares[0] / squares[1].clip(min=1e-300))
 
     def dissipated(self, h: int) -> np.ndarray:
         """Return the power of the friction of each joint over that of its force, ``(N,)``."""
         n, v = self.data.q.shape[1], self.data.v
-        x, theta = chain_columns(self.data, self.regressor), self.theta[:, h].copy()
-        own = theta[-OWN * n :].reshape(n, OWN)
-        own[:, :3] = 0.0  # offset, spring and rotor
-        theta[: -OWN * n] = 0.0
+        columns = np.arange(self.x.shape[2])[-OWN * n :].reshape(n, OWN)[:, 3:].ravel()
+        friction = self.x[:, :, columns] @ self.theta[columns, h]
         force = np.abs(self.y[:, :, h] * v).mean(axis=0).clip(min=1e-300)
-        return np.asarray((x @ theta * v).mean(axis=0) / force)
+        return np.asarray((friction * v).mean(axis=0) / force)
 
 
 def _readings(joints: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
@@ -238,16 +226,12 @@ def _readings(joints: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array([x for x, _ in pairs]), np.array([x for _, x in pairs])
 
 
-def _gains(x: np.ndarray, u: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _gains(columns: np.ndarray, u: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the sizes of the gains of the inputs with the smallest residual, ``(M,)``."""
-    y = np.zeros((*u.shape, u.shape[1]))
-    for k in range(u.shape[1]):
-        y[:, k, k] = (u * mask)[:, k]
-    columns, y = x.reshape(-1, x.shape[2]), y.reshape(-1, u.shape[1])
-    cross = columns.T @ y
-    left = y.T @ y - cross.T @ _solve(columns.T @ columns, cross)
-    size = np.sqrt(np.diag(y.T @ y)).clip(min=1e-300)
-    _, vectors = np.linalg.eigh(left / np.outer(size, size))
+    y = ((u * mask)[:, :, None] * np.eye(u.shape[1])).reshape(-1, u.shape[1])
+    left = y - columns @ solve(columns, y)
+    size = np.linalg.norm(y, axis=0).clip(min=1e-300)
+    _, vectors = np.linalg.eigh(left.T @ left / np.outer(size, size))
     return np.abs(vectors[:, 0]).clip(min=1e-3) / size
 
 
@@ -265,6 +249,11 @@ class Order(NamedTuple):
     joints: Sequence[int]
     signs: np.ndarray
     unexplained: np.ndarray
+
+    @property
+    def exchanged(self) -> bool:
+        """True if inputs are exchanged."""
+        return any(x.name == EXCHANGED and x.verdict != "ok" for x in self.measurements)
 
     def corrected(self, data: Averages) -> Averages:
         """Return averages with the inputs of the joints in turn, and their signs."""

@@ -29,7 +29,7 @@ from pinn_dyn.log_check.averages import (
     white_noise,
     with_products,
 )
-from pinn_dyn.log_check.chain import EXCHANGED, Order, chain_regressor, check_order
+from pinn_dyn.log_check.chain import chain_regressor, check_order
 from pinn_dyn.log_check.delay import (
     INTERVAL,
     DelayCurve,
@@ -43,13 +43,18 @@ from pinn_dyn.log_check.input_faults import SATURATED, input_faults
 from pinn_dyn.log_check.numbers import check_angles, check_velocity_lag
 from pinn_dyn.log_check.page import LogCheck, store, stored
 from pinn_dyn.log_check.runs import (
+    Equation,
     Interval,
-    Motion,
     check_rests,
     check_runs,
-    equations_of_motion,
+    equation_of_motion,
 )
-from pinn_dyn.log_check.structure import FIT, compare_structure, regressor
+from pinn_dyn.log_check.structure import (
+    StructureFit,
+    compare_structure,
+    fit_structure,
+    regressor,
+)
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.structure import Structure
 
@@ -99,8 +104,45 @@ def residual_figure(source: logs.LogSource, structure: Structure) -> Figure | No
     if not widths:
         return None
     data = widths[compared(widths)[0]]
-    motion = equations_of_motion(data, source.q, source.u, data.width, rigid)
+    motion = equation_of_motion(data, source.q, source.u, data.width, rigid)
     return None if motion is None else residuals(motion, source.q, source.v, source.u)
+
+
+@dataclass(frozen=True)
+class _Log:
+    """A log, and what is known before its equation of motion.
+
+    Attributes:
+        source: the log.
+        structure: kinematics of its robot, or None.
+        rigid: regressor of a robot with an input per joint, or None.
+        training, others: stretches of the training, and of validation and test.
+        step: sample time, s.
+        longest_delay: longest delay of an input that is tried, s.
+        servo: the inputs are targets of servos.
+    """
+
+    source: logs.LogSource
+    structure: Structure | None
+    rigid: Regressor | None
+    training: Sequence[logs.Recording]
+    others: Sequence[logs.Recording]
+    step: float
+    longest_delay: float
+    servo: bool
+
+    @property
+    def square(self) -> bool:
+        """True for an input per coordinate."""
+        return len(self.source.u.columns) == len(self.source.q.columns)
+
+    def of_training(self, widths: Sequence[Averages]) -> list[Averages]:
+        """Return the averages of the training."""
+        return [x.rows(x.stretch < len(self.training)) for x in widths]
+
+    def clear_delays(self, curves: Sequence[DelayCurve]) -> list[float]:
+        """Return the delay of each input that is clear, s; 0 for others. The lag of a servo is none."""
+        return [0.0] * len(curves) if self.servo else clear_delays(curves, self.step)
 
 
 @dataclass
@@ -108,20 +150,30 @@ class _Answers:
     """Answers of the equation of motion to the questions about a log.
 
     Attributes:
-        measurements: measurements.
         curves: delay curve of each input.
         clear: delay of each input that is clear, s; 0 for others.
         held: rows for which the values of an input repeat, where its motion follows lines; else 1.
-        motion: averages and equations; None if the rows are too few.
+        measurements: measurements.
+        late: averages with kernels of two widths, and inputs as they act.
+        motion: equation of motion; None if the rows are too few.
+        fit: comparison with the bodies of a URDF.
         driven: joint that each input drives, if there are fewer inputs than coordinates.
+        odd: parts of runs that do not fit the others.
+        of_parts: measurements of these parts.
+        saturated: a drive saturates.
     """
 
-    measurements: list[Measurement]
     curves: list[DelayCurve]
     clear: list[float]
     held: list[int]
-    motion: Motion | None = None
+    measurements: list[Measurement]
+    late: Sequence[Averages] = ()
+    motion: Equation | None = None
+    fit: StructureFit | None = None
     driven: Sequence[int] = ()
+    odd: Sequence[Interval] = ()
+    of_parts: Sequence[Measurement] = ()
+    saturated: bool = False
 
 
 def check(
@@ -154,12 +206,14 @@ def check(
     noise = coordinates["noise of q"].to_numpy()
     highest = bandwidth([item.q for item in training], step, noise)
     servo = _follows_targets(source, training, step, longest_delay)
+    rigid = _regressor(structure, inputs)
+    parts = [parts_of(items, step) for items in (training, others)]
     rows = max(held_rows(item.q) for _, item in stretches)
     if rows == 1:
-        answers = _answers(source, training, others, step, longest_delay, structure, servo)
+        answers = _answers(_Log(source, structure, rigid, *parts, step, longest_delay, servo))
     else:  # the acceleration of held values means nothing
-        answers = _Answers([_held(rows, step)], [], [0.0] * inputs, [rows] * inputs)
-    store(source, _regressor(structure, inputs), answers.measurements)
+        answers = _Answers([], [0.0] * inputs, [rows] * inputs, [_held(rows, step)])
+    store(source, rigid, answers.measurements)
     measurements = [*source.measurements, *answers.measurements, *_limited(coordinates)]
     excitation = None
     if structure is not None:
@@ -189,143 +243,113 @@ def check(
     )
 
 
-def _answers(
-    source: logs.LogSource,
-    training: Sequence[logs.Recording],
-    others: Sequence[logs.Recording],
-    step: float,
-    longest: float,
-    structure: Structure | None,
-    servo: bool,
-    odd: Sequence[Interval] = (),
-) -> _Answers:
+def _answers(log: _Log) -> _Answers:
     """Ask the equation of motion, without the parts of runs that do not fit the others."""
-    inputs, size = len(source.u.columns), len(source.q.columns)
-    rigid = _regressor(structure, inputs)
-    first = parts_of(training, step)
-    everything = [*first, *parts_of(others, step)]
-    names = list(dict.fromkeys(item.run for item in everything))
-    if inputs > size:
+    everything = [*log.training, *log.others]
+    if len(log.source.u.columns) > len(log.source.q.columns):
         everything = [with_products(item) for item in everything]
-    widths = averages_of_widths(everything, step)
-    if odd:
-        widths = [data.rows(~np.any([x.of(data) for x in odd], axis=0)) for data in widths]
-    of_training = [data.rows(data.stretch < len(first)) for data in widths]
-    curves = input_delays(first, longest=longest, rigid=rigid, widths=of_training)
+    widths = averages_of_widths(everything, log.step)
+    answers = _asked(log, widths)
+    if answers.odd:
+        odd = [np.any([x.of(data) for x in answers.odd], axis=0) for data in widths]
+        again = _asked(log, [x.rows(~rows) for x, rows in zip(widths, odd, strict=True)])
+        if not again.saturated:  # parts that do not fit look like a saturation
+            names = {x.name for x in answers.of_parts}
+            kept = [x for x in again.measurements if x.name not in names]
+            answers = replace(again, measurements=[*answers.of_parts, *kept])
+    if answers.late:
+        _describe(log, answers, everything)
+    return answers
+
+
+def _asked(log: _Log, widths: Sequence[Averages]) -> _Answers:
+    """Ask for the order, the faults and the delays of the inputs, and compare the runs."""
+    source, training = log.source, log.of_training(widths)
+    curves = input_delays(log.training, longest=log.longest_delay, rigid=log.rigid, widths=training)
     if not widths:
-        return _Answers([], curves, [0.0] * inputs, [1] * inputs)
+        return _Answers(curves, [0.0] * len(curves), [1] * len(curves), [])
     chosen = [widths[k] for k in compared(widths)]
-    asked = _ask_inputs(source, chosen, len(first), curves, rigid, step, servo)
-    late = [x.delayed(asked.clear) for x in chosen]
-    if asked.order is not None and inputs == size:
-        late = [asked.order.corrected(x) for x in late]
-    data = [x.rows(x.stretch < len(first)) for x in late]
-    of_robot = [] if structure is None else compare_structure(structure, data, source.u)
-    wrong = {x.place for x in of_robot if x.name == FIT and x.verdict != "ok"}
-    if wrong and structure is not None:  # whose delays are wrong, too
-        pairs = zip(asked.curves, structure.joint_names, strict=True)
-        asked.curves = [x.without(_WRONG) if j in wrong and x.of_bodies else x for x, j in pairs]
-        asked.clear = [0.0] * inputs if servo else clear_delays(asked.curves, step)
-    narrow, wide = _motions(source, late, rigid, exact=rigid is not None and not wrong)
-    # A fault of an input or of the clock explains runs that differ.
-    clocks = [x for x in source.measurements if x.name in (LOST, STATE)]
-    bad = {x.name for x in [*asked.faults, *clocks] if x.verdict != "ok"}
-    of_parts: list[Measurement] = []
-    parts: list[Interval] = []
-    if bad <= {SATURATED}:
-        of_parts, parts = check_rests(narrow, wide, names)
-        if not parts:
-            of_runs, parts = check_runs(narrow, wide, names, exact=not wrong)
-            of_parts += of_runs
-    if parts and not odd:
-        again = _answers(source, training, others, step, longest, structure, servo, parts)
-        saturated = any(x.name == SATURATED and x.verdict != "ok" for x in again.measurements)
-        if not saturated:  # parts that do not fit look like a saturation
-            kept = [x for x in again.measurements if x.name not in {x.name for x in of_parts}]
-            return replace(again, measurements=of_parts + kept)
-    order = asked.order
-    results = [] if bad else of_parts + ([] if order is None else order.measurements)
-    results += asked.faults + _coordinates_measured(source, everything, late[0], structure, step)
-    results += _inputs_measured(source, data[0], asked.curves, asked.clear) + of_robot
-    drawn = narrow
-    if wrong:
-        drawn = equations_of_motion(late[0], source.q, source.u, late[0].width, rigid)
-    driven = order.joints if order is not None and inputs < size else []
-    return _Answers(results, asked.curves, asked.clear, asked.held, drawn, driven)
-
-
-@dataclass
-class _Inputs:
-    """Answers about the inputs: faults, delay curves, clear delays, rows of a hold, and order."""
-
-    faults: list[Measurement]
-    curves: list[DelayCurve]
-    clear: list[float]
-    held: list[int]
-    order: Order | None
-
-
-def _ask_inputs(
-    source: logs.LogSource,
-    widths: Sequence[Averages],
-    training: int,
-    curves: list[DelayCurve],
-    rigid: Regressor | None,
-    step: float,
-    servo: bool,
-) -> _Inputs:
-    """Ask for the order of the inputs, for their faults, and for their delays beside them."""
-    # The lag of a servo is no delay.
-    clear = [0.0] * len(curves) if servo else clear_delays(curves, step)
+    clear = log.clear_delays(curves)
     order = None
-    if not servo:
-        order = check_order([x.delayed(clear) for x in widths], source.u, source.q.units)
-    of_training = [x.rows(x.stretch < training) for x in widths]
+    if not log.servo:
+        order = check_order([x.delayed(clear) for x in chosen], source.u, source.q.units)
     unexplained = None if order is None else order.unexplained
-    faults, curves, held = input_faults(of_training, curves, source.u, rigid, unexplained)
+    faults, curves, held = input_faults(
+        log.of_training(chosen), curves, source.u, log.rigid, unexplained
+    )
     states = {x.place for x in source.measurements if x.name == STATE and x.verdict == "stop"}
     pairs = zip(curves, source.u.columns, strict=False)
     curves = [x.without("the input is a state") if name in states else x for x, name in pairs]
-    bad = {x.name for x in order.measurements if x.verdict != "ok"} if order else set()
-    if EXCHANGED in bad:
+    if order is not None and order.exchanged:
         curves = [x.without("the inputs are exchanged") for x in curves]
-    clear = [0.0] * len(curves) if servo else clear_delays(curves, step)
-    return _Inputs(faults, curves, clear, held, order)
+    clear = log.clear_delays(curves)
+    late = [x.delayed(clear) for x in chosen]
+    if order is not None and log.square:
+        late = [order.corrected(x) for x in late]
+    fit = None if log.structure is None else fit_structure(log.structure, log.of_training(late))
+    fits = fit is None or not fit.bad
+    narrow, wide = _equations(log, late, fits)
+    answers = _Answers(curves, clear, held, [], late, narrow, fit)
+    # A fault of an input or of the clock explains runs that differ.
+    clocks = [x for x in source.measurements if x.name in (LOST, STATE)]
+    bad = {x.name for x in [*faults, *clocks] if x.verdict != "ok"}
+    if bad <= {SATURATED}:
+        names = list(dict.fromkeys(item.run for item in late[0].recordings))
+        answers.of_parts, answers.odd = check_rests(narrow, wide, names)
+        if not answers.odd:
+            of_runs, answers.odd = check_runs(narrow, wide, names, exact=fits)
+            answers.of_parts = [*answers.of_parts, *of_runs]
+    if not bad:
+        answers.measurements += [*answers.of_parts, *([] if order is None else order.measurements)]
+    answers.measurements += faults
+    answers.saturated = SATURATED in bad
+    if order is not None and not log.square:
+        answers.driven = order.joints
+    return answers
 
 
-def _motions(
-    source: logs.LogSource, widths: Sequence[Averages], rigid: Regressor | None, *, exact: bool
-) -> list[Motion | None]:
+def _describe(log: _Log, answers: _Answers, recordings: Sequence[logs.Recording]) -> None:
+    """Add what the averages say of coordinates, inputs and the URDF to the answers."""
+    source, data = log.source, answers.late[0]
+    of_robot: list[Measurement] = []
+    if answers.fit is not None and log.structure is not None:
+        of_robot, wrong = compare_structure(log.structure, answers.fit, source.u)
+        if wrong:  # whose delays are wrong, too
+            for k in wrong:
+                if answers.curves[k].of_bodies:
+                    answers.curves[k] = answers.curves[k].without(_WRONG)
+            answers.clear = log.clear_delays(answers.curves)
+            answers.motion = equation_of_motion(data, source.q, source.u, data.width, log.rigid)
+    free = [False] * len(source.q.columns) if log.structure is None else _free(log.structure)
+    answers.measurements += check_angles(data, source.q, free)
+    if source.v is not None:
+        answers.measurements += check_velocity_lag(
+            recordings, source.q, source.v, log.step, data.width
+        )
+    (training,) = log.of_training([data])
+    answers.measurements += _inputs_measured(source, training, answers.curves, answers.clear)
+    answers.measurements += of_robot
+
+
+def _equations(log: _Log, widths: Sequence[Averages], fits: bool) -> list[Equation | None]:
     """Return the equations with kernels of two widths.
 
     They are those of rigid bodies, or of a chain of unknown bodies. If these leave a part, those of
     single joints are used if they leave half of that: they have many more constants.
     """
-    width, chain = max(x.width for x in widths), chain_regressor(source.q.units)
-    results: list[Motion | None] = []
-    least = np.inf
-    for bodies in dict.fromkeys([rigid if exact else chain, None]):
-        motions = [equations_of_motion(x, source.q, source.u, width, bodies) for x in widths]
-        left = np.inf if motions[0] is None else float(np.median(motions[0].usual()))
-        if not results or left < least / 2:
-            results, least = motions, left
-        if left < _FITS:
-            break
-    return results
+    q, u, width = log.source.q, log.source.u, max(x.width for x in widths)
 
+    def equations(bodies: Regressor | None) -> tuple[list[Equation | None], float]:
+        results = [equation_of_motion(x, q, u, width, bodies) for x in widths]
+        first = results[0]
+        return results, np.inf if first is None else float(np.median(first.usual()))
 
-def _coordinates_measured(
-    source: logs.LogSource,
-    parts: Sequence[logs.Recording],
-    data: Averages,
-    structure: Structure | None,
-    step: float,
-) -> list[Measurement]:
-    """Measure wraps of angles and the lag of velocities."""
-    free = [False] * len(source.q.columns) if structure is None else _free(structure)
-    results = check_angles(data, source.q, free)
-    if source.v is not None:
-        results += check_velocity_lag(parts, source.q, source.v, step, data.width)
+    chain = chain_regressor(q.units) if log.square else None
+    bodies = log.rigid if log.rigid is not None and fits else chain
+    results, left = equations(bodies)
+    if bodies is not None and left >= _FITS:
+        of_joints, least = equations(None)
+        results = of_joints if least < left / 2 else results
     return results
 
 

@@ -112,6 +112,24 @@ class EquationOfMotionRegression:
         return np.asarray(squares[blocks, blocks])
 
 
+def solve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return theta of least squares with columns x ``(R, P)`` and one or more y."""
+    scale = np.sqrt((x**2).mean(axis=0)).clip(min=1e-300)
+    x = x / scale
+    normal = x.T @ x
+    ridge = _RIDGE * np.trace(normal) / len(normal) + 1e-300
+    theta = np.linalg.solve(normal + ridge * np.eye(len(normal)), x.T @ y)
+    return np.asarray((theta.T / scale).T)
+
+
+def unexplained(y: np.ndarray, *x: np.ndarray) -> float:
+    """Return the mean share of the variance of y that (1, x) leaves, per degree of freedom."""
+    columns, y = np.hstack([np.ones((len(y), 1)), *x]), y - y.mean(axis=0)
+    squares = ((y - columns @ solve(columns, y)) ** 2).mean(axis=0)
+    shares = (squares / (y**2).mean(axis=0).clip(min=1e-300)).clip(1e-12, 1)
+    return float(shares.mean()) * len(y) / max(len(y) - columns.shape[1], 1)
+
+
 def terms(data: Averages, form: str) -> np.ndarray:
     """Return the terms that explain the motion in a form apart from the input, ``(R, P)``.
 

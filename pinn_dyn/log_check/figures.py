@@ -9,7 +9,7 @@ import numpy as np
 
 from pinn_dyn.data.logs import Columns
 from pinn_dyn.log_check.delay import DelayCurve
-from pinn_dyn.log_check.runs import Motion
+from pinn_dyn.log_check.runs import Equation
 from pinn_dyn.plots import COLORS, TRUTH, legend_below, panels
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ _DRAWN = 1000  # rows of the equation of motion
 _BINS, _FEWEST = 40, 5  # parts of the range of a state; rows of a part
 
 
-def forces(motion: Motion, inputs: Sequence[str]) -> Figure:
+def forces(motion: Equation, inputs: Sequence[str]) -> Figure:
     """Draw y, X theta and the residual of each equation of motion in the longest run.
 
     ``inputs`` are labels of the inputs with their units.
@@ -29,7 +29,7 @@ def forces(motion: Motion, inputs: Sequence[str]) -> Figure:
     rows = np.flatnonzero(data.run == np.bincount(data.run).argmax())[:_DRAWN]
     t = data.t[rows]
     breaks = np.flatnonzero(np.diff(t) > 10 * np.median(np.diff(t))) + 1  # between stretches
-    measured, explained = motion.measured()[rows], motion.predicted()[rows]
+    measured, explained = motion.y[rows], motion.predicted()[rows]
     figure, (axes,) = panels([labels], t, title="Forces and the equation of motion, means removed")
     curves = {
         "measured": (measured, TRUTH),
@@ -44,18 +44,18 @@ def forces(motion: Motion, inputs: Sequence[str]) -> Figure:
     return figure
 
 
-def residuals(motion: Motion, q: Columns, v: Columns | None, u: Columns) -> Figure | None:
+def residuals(motion: Equation, q: Columns, v: Columns | None, u: Columns) -> Figure | None:
     """Draw the residual of each force over position and speed of its joint; None for others.
 
     Args:
-        motion: equations of motion, one per joint.
+        motion: equation of motion of each joint.
         q, v: columns of the log, whose units the axes have; without v those of q per second.
         u: columns of the forces, which are drawn in SI units.
     """
     from matplotlib.figure import Figure  # takes a quarter of a second
 
     count = len(q.columns)
-    if motion.equations[0].joints is None:
+    if not motion.of_joints:
         return None
     figure = Figure(figsize=(9.0, 1.7 * count + 0.8), layout="constrained")
     grid = figure.subplots(count, 2, squeeze=False, sharey="row")
@@ -64,8 +64,8 @@ def residuals(motion: Motion, q: Columns, v: Columns | None, u: Columns) -> Figu
     units = {"q": q.unit, "v": [f"{x}/s" for x in q.unit]}
     if v is not None:
         states["v"], names["v"], units["v"] = v.from_si(motion.data.v), v.columns, v.unit
-    left = motion.measured() - motion.predicted()
-    friction = np.hstack([x.dry_friction() for x in motion.equations])
+    left = motion.y - motion.predicted()
+    friction = motion.part(motion.friction)
     for k, label in enumerate(motion.labels):
         moving = motion.data.moving[:, k]
         forces = {"q": left[:, k], "v": left[:, k] + friction[:, k]}

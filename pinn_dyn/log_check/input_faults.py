@@ -12,12 +12,7 @@ from pinn_dyn.data.logs.check.checks import held_rows
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import Averages
 from pinn_dyn.log_check.delay import FEWEST, DelayCurve, minimum
-from pinn_dyn.log_check.equation import (
-    EquationOfMotionRegression,
-    Regressor,
-    bodies,
-    force_columns,
-)
+from pinn_dyn.log_check.equation import Regressor, bodies, force_columns, solve
 
 HELD = "rows between two values of the input"
 """Name of the measurement of inputs that are slower than the log."""
@@ -48,9 +43,7 @@ class _Trial:
         """Return what the columns leave of y ``(R, K)``, fitted in the rows of a mask."""
         rows = np.ones(len(y), dtype=bool) if fitted is None else fitted
         x = np.column_stack([self.explained, np.ones(len(y))])
-        columns = {"x": x[rows], "y": y[rows]}
-        regression = EquationOfMotionRegression(columns, np.zeros(rows.sum(), dtype=int))
-        return y - x @ regression.fit("y", ["x"]).theta[0]
+        return y - x @ solve(x[rows], y[rows])
 
     def shares(self, y: np.ndarray) -> np.ndarray:
         """Return the share of the variance of each column of y that stays unexplained, ``(K,)``."""

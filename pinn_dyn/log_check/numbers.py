@@ -11,7 +11,7 @@ import numpy as np
 from pinn_dyn.data.logs import Columns, Measurement, Recording
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import Averages
-from pinn_dyn.log_check.equation import EquationOfMotionRegression, terms
+from pinn_dyn.log_check.equation import terms, unexplained
 
 _LAGS = 30  # of a target that are tried
 _STILL = 0.01  # variance of a coordinate at rest as a share of the largest
@@ -21,15 +21,6 @@ _BETTER = 0.5  # residual with one unit of an angle over that with the other
 _EXACT = 1e-6  # residual that is one of rounding
 _LONGEST, _LAGGED = 0.2, 0.5  # lag of v, s; share over that without a lag
 _CLEAR = 0.8  # correlation of v and dq/dt
-
-
-def unexplained(data: Averages, y: np.ndarray, *x: np.ndarray) -> float:
-    """Return the mean share of the variance of y that (1, x) leaves, per degree of freedom."""
-    one = np.ones((len(data), 1))
-    columns = {"x": np.hstack([one, *x]), "y": y - y.mean(axis=0)}
-    regression = EquationOfMotionRegression(columns, np.zeros(len(data), dtype=int))
-    freedom = max(len(data) - columns["x"].shape[1], 1)
-    return float(regression.fit("y", ["x"]).shares()[0].mean()) * len(data) / freedom
 
 
 def explained_share(data: Averages) -> float:
@@ -44,10 +35,10 @@ def explained_share(data: Averages) -> float:
         return 1.0
     known = q, np.sin(q), np.cos(q)
     return max(
-        unexplained(data, v, *known) - unexplained(data, v, *known, u),
-        unexplained(data, data.a, *known, v) - unexplained(data, data.a, *known, v, u),
+        unexplained(v, *known) - unexplained(v, *known, u),
+        unexplained(data.a, *known, v) - unexplained(data.a, *known, v, u),
         # The acceleration of a controlled robot may follow from q and v; its torque then does too.
-        1 - unexplained(data, u, *known, v, data.a),
+        1 - unexplained(u, *known, v, data.a),
     )
 
 
@@ -101,18 +92,15 @@ def _turns(data: Averages, k: int) -> bool:
     if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
         return True
     a, inputs = data.a[:, [k]], data.u
-    plain = min(unexplained(data, a, data.v), unexplained(data, a, data.v, data.q))
-    periodic = unexplained(data, a, data.v, np.sin(data.q), np.cos(data.q))
-    if (
-        periodic < _PERIODIC * plain
-        or unexplained(data, a, data.v, inputs, np.sign(data.v)) < _FREE
-    ):
+    plain = min(unexplained(a, data.v), unexplained(a, data.v, data.q))
+    periodic = unexplained(a, data.v, np.sin(data.q), np.cos(data.q))
+    if periodic < _PERIODIC * plain or unexplained(a, data.v, inputs, np.sign(data.v)) < _FREE:
         return True
     degrees = np.where(np.arange(data.q.shape[1]) == k, math.pi / 180, 1.0)
     converted = replace(data, q=data.q * degrees)
     y = data.u if inputs.shape[1] else a
     form = "inverse dynamics" if inputs.shape[1] else "acceleration"
-    in_radians, in_degrees = (unexplained(data, y, terms(x, form)) for x in (data, converted))
+    in_radians, in_degrees = (unexplained(y, terms(x, form)) for x in (data, converted))
     return in_radians < _BETTER * in_degrees and in_degrees > _EXACT
 
 
@@ -130,9 +118,7 @@ def check_velocity_lag(
     results = []
     for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
         measured = data.input_at(k, data.t[:, None] - lags * step)
-        columns = {"v": measured, "slope": data.v[:, k], "one": np.ones(len(data))}
-        regression = EquationOfMotionRegression(columns, np.zeros(len(data), dtype=int))
-        shares = regression.fit("v", ["slope", "one"]).shares()[0]
+        shares = np.array([unexplained(x, data.v[:, [k]]) for x in measured.T[:, :, None]])
         best = int(shares.argmin())
         # Lag l of a column means that it is read l samples earlier: a late v needs a negative one.
         lag = -lags[best] * step

@@ -34,7 +34,7 @@ from pinn_dyn.identification.rigid_excitation import RigidExcitation
 from pinn_dyn.log_check.delay import DelayCurve
 from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import delay_curves, forces, residuals
-from pinn_dyn.log_check.runs import Motion
+from pinn_dyn.log_check.runs import Equation
 
 
 def store(source: LogSource, rigid: Regressor | None, measurements: Sequence[Measurement]) -> None:
@@ -105,7 +105,7 @@ class LogCheck:
         candidates: models of a training, each with the reason and its options.
         driven: number of the joint that each input drives, of fewer inputs than coordinates.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
-        motion: averages and equations of motion; None if there are too few rows for an equation.
+        motion: equation of motion; None if there are too few rows for an equation.
     """
 
     source: logs.LogSource
@@ -120,7 +120,7 @@ class LogCheck:
     hold: bool = False
     driven: Sequence[int] = ()
     rigid: RigidExcitation | None = None
-    motion: Motion | None = None
+    motion: Equation | None = None
 
     @property
     def problems(self) -> list[str]:

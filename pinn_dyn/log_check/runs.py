@@ -8,7 +8,7 @@ a = f(q, v) + B u if it leaves less. Without inputs, a = f(q, v).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,9 +20,9 @@ from pinn_dyn.data.logs import Columns, Measurement
 from pinn_dyn.data.logs.errors import listed
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import CUT, Averages
-from pinn_dyn.log_check.chain import OWN, chain_columns, solve
+from pinn_dyn.log_check.chain import OWN, chain_columns
 from pinn_dyn.log_check.delay import FEWEST
-from pinn_dyn.log_check.equation import Regressor, force_columns, terms
+from pinn_dyn.log_check.equation import Regressor, force_columns, solve, terms
 
 RESIDUAL = "residual over that of the median window"
 """Name of the measurement that compares the windows of runs."""
@@ -68,16 +68,18 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class Equation:
-    """An equation of motion y = X theta of all runs, fitted to the windows that agree.
+    """An equation of motion y_k = X_k theta_k of all runs, fitted to the windows that agree.
 
     Attributes:
-        data: averages.
-        x, y: columns ``(R, K, P)`` and left sides ``(R, K)``, without their medians ``offset``.
+        data: averages, with the inputs at the times when they act.
+        x, y: columns ``(R, K, P)`` and left sides ``(R, K)``, without their medians.
         labels: names of the left sides.
         window: number of the window of each row, ``(R,)``.
-        joints: joint of each left side, whose dry friction may hold it at rest; None without.
-        friction: columns of dry friction of each left side, ``(K, F)``.
-        damping: column of viscous friction of each left side, ``(K,)``.
+        numbers: numbers of the windows, ``(B,)``, by time: kernels of other widths have the same.
+        shared: all left sides have the same theta, as of one robot.
+        of_forces: the left sides are forces.
+        friction: columns of dry friction of each left side ``(K, F)``, which may hold its joint.
+        damping: column of viscous friction of each left side, ``(K, 1)``.
     """
 
     data: Averages
@@ -85,22 +87,28 @@ class Equation:
     y: np.ndarray
     labels: Sequence[str]
     window: np.ndarray
-    joints: Sequence[int] | None = None
-    friction: Sequence[Sequence[int]] = ()
-    damping: Sequence[int] = ()
+    numbers: np.ndarray
+    shared: bool
+    of_forces: bool
+    friction: np.ndarray
+    damping: np.ndarray
 
     @cached_property
     def row_weights(self) -> np.ndarray:
         """Weights of the rows, ``(R, 1)``, small at jumps of q."""
         return self.data.row_weights()
 
+    @property
+    def of_joints(self) -> bool:
+        """True if each left side is the force of a joint."""
+        return self.friction.size > 0
+
     @cached_property
     def resting(self) -> np.ndarray:
         """Rows in which the joint of a left side rests, ``(R, K)``."""
-        if self.joints is None:
+        if not self.of_joints:
             return np.zeros(self.y.shape, dtype=bool)
-        moving = self.data.moving[:, list(self.joints)]
-        return ~moving & (moving.sum(axis=0) >= FEWEST)
+        return ~self.data.moving & (self.data.moving.sum(axis=0) >= FEWEST)
 
     @cached_property
     def size(self) -> np.ndarray:
@@ -114,10 +122,12 @@ class Equation:
         return np.sqrt(np.transpose(squares) / np.bincount(self.window)[:, None])
 
     def fitted(self, weights: np.ndarray) -> np.ndarray:
-        """Return theta ``(P,)`` for weights of the windows ``(B,)``."""
+        """Return theta ``(K, P)`` for weights of the windows ``(B,)``."""
         rows = self.row_weights * np.sqrt(weights)[self.window, None] * ~self.resting / self.size
-        x = (self.x * rows[:, :, None]).reshape(-1, self.x.shape[2])
-        return solve(x, (self.y * rows).ravel())
+        x, y = self.x * rows[:, :, None], self.y * rows
+        if self.shared:
+            return np.tile(solve(x.reshape(y.size, -1), y.ravel()), (y.shape[1], 1))
+        return np.stack([solve(x[:, k], y[:, k]) for k in range(y.shape[1])])
 
     def residual(self, theta: np.ndarray) -> np.ndarray:
         """Return the residual of each window as a share of its signal, ``(B, K)``.
@@ -125,31 +135,22 @@ class Equation:
         The share is that of the median window if that window has a larger signal. At rest dry
         friction may hold any force up to its level, which does not count.
         """
-        left = np.abs(self.y - self.x @ theta)
+        left = np.abs(self.y - np.einsum("rkp,kp->rk", self.x, theta))
         at_rest = (left - self.friction_level(theta)).clip(min=0)
         left = np.where(self.resting, at_rest, left)
         return self.means(left) / np.maximum(self.means(self.y), self.size)
 
     def friction_level(self, theta: np.ndarray) -> np.ndarray:
         """Return the largest dry friction of each joint, ``(K,)``."""
-        levels = np.zeros(self.y.shape[1])
-        for k, columns in enumerate(self.friction):
-            levels[k] = np.abs(self.x[:, k, columns]).max(axis=0) @ np.abs(theta[columns])
-        return levels
+        pairs = enumerate(self.friction)
+        return np.array(
+            [np.abs(self.x[:, k, c]).max(axis=0) @ np.abs(theta[k, c]) for k, c in pairs]
+        )
 
-    def dry_friction(self) -> np.ndarray:
-        """Return the part of X theta that is dry friction of the own joint, ``(R, K)``."""
-        result = np.zeros(self.y.shape)
-        for k, columns in enumerate(self.friction):
-            result[:, k] = self.x[:, k, columns] @ self.theta[columns]
-        return result
-
-    def dissipation(self) -> np.ndarray:
-        """Return the part of X theta that is dry and viscous friction, ``(R, K)``."""
-        result = self.dry_friction()
-        for k, column in enumerate(self.damping):
-            result[:, k] += self.x[:, k, column] * self.theta[column]
-        return result
+    def part(self, columns: Iterable[np.ndarray]) -> np.ndarray:
+        """Return the part of X theta in some columns of each left side, ``(R, K)``."""
+        parts = [self.x[:, k, c] @ self.theta[k, c] for k, c in enumerate(columns)]
+        return np.stack(parts, axis=1)
 
     @cached_property
     def base(self) -> np.ndarray:
@@ -194,7 +195,7 @@ class Equation:
 
     @cached_property
     def theta(self) -> np.ndarray:
-        """Coefficients, ``(P,)``."""
+        """Coefficients, ``(K, P)``."""
         return self.fitted(self.weights)
 
     def usual(self) -> np.ndarray:
@@ -213,59 +214,7 @@ class Equation:
 
     def predicted(self) -> np.ndarray:
         """Return X theta, ``(R, K)``."""
-        return self.x @ self.theta
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Averages of a log with the inputs at the times when they act, and its equations of motion.
-
-    Attributes:
-        data: averages.
-        equations: one of all joints, or one of each input, or of v or a.
-        numbers: numbers of the windows, ``(B,)``, by time: kernels of other widths have the same.
-        of_forces: the left sides are forces.
-        exact: the equation is one of all joints of a robot.
-    """
-
-    data: Averages
-    equations: Sequence[Equation]
-    numbers: np.ndarray
-    of_forces: bool = True
-    exact: bool = True
-
-    @property
-    def labels(self) -> list[str]:
-        """Names of all left sides."""
-        return [label for x in self.equations for label in x.labels]
-
-    @property
-    def window(self) -> np.ndarray:
-        """Number of the window of each row, ``(R,)``."""
-        return self.equations[0].window
-
-    def residual(self, run: int | None = None) -> np.ndarray:
-        """Return the residual of each window, ``(B, K)``; of fits that include a run, if given."""
-        parts = []
-        for equation in self.equations:
-            theta = equation.theta
-            if run is not None:
-                of_run = np.bincount(self.window, self.data.run == run) > 0
-                theta = equation.fitted(np.where(of_run, 1.0, equation.weights))
-            parts.append(equation.residual(theta))
-        return np.hstack(parts)
-
-    def usual(self) -> np.ndarray:
-        """Return the residual of the median window that agrees, ``(K,)``."""
-        return np.hstack([x.usual() for x in self.equations])
-
-    def predicted(self) -> np.ndarray:
-        """Return X theta of all left sides, ``(R, K)``."""
-        return np.hstack([x.predicted() for x in self.equations])
-
-    def measured(self) -> np.ndarray:
-        """Return all left sides, ``(R, K)``."""
-        return np.hstack([x.y for x in self.equations])
+        return np.asarray(np.einsum("rkp,kp->rk", self.x, self.theta))
 
 
 def windows(data: Averages, width: float) -> np.ndarray:
@@ -278,14 +227,14 @@ def windows(data: Averages, width: float) -> np.ndarray:
     return np.where(counts[numbers] >= _FEWEST, numbers, -1)
 
 
-def equations_of_motion(
+def equation_of_motion(
     data: Averages,
     q: Columns,
     u: Columns,
     width: float,
     bodies: Regressor | None = None,
-) -> Motion | None:
-    """Return the equations of motion of a log; None if the rows are too few.
+) -> Equation | None:
+    """Return the equation of motion of a log; None if the rows are too few.
 
     Args:
         data: averages, with the inputs at the times when they act.
@@ -295,33 +244,24 @@ def equations_of_motion(
     """
     window = windows(data, width)
     data, window = data.rows(window >= 0), window[window >= 0]
+    n, size, joint = len(q.columns), len(u.columns), np.arange(len(q.columns))[:, None]
+    data = replace(data, u=data.u[:, :size])  # no products of inputs
     if not len(data):
         return None
-    numbers, window = np.unique(window, return_inverse=True)
-    n, size = len(q.columns), len(u.columns)
-    data = replace(data, u=data.u[:, :size])  # no products of inputs
     if size > n or not size:
-        equations = _of_states(data, q, window)
-    elif bodies is not None and size == n:
+        return _of_states(data, q, window)
+    shared = bodies is not None and size == n
+    if bodies is not None and shared:
         x = chain_columns(data, bodies)
-        first = x.shape[2] - OWN * n + OWN * np.arange(n)  # of each joint
-        friction, damping = first[:, None] + [4, 5, 6], first + 3
-        equations = [
-            _equation(data, x, data.u, u.columns, window, range(n), friction.tolist(), damping)
-        ]
+        first = x.shape[2] - OWN * n + OWN * joint
+        friction, damping = first + [4, 5, 6], first + 3
     else:
-        equations = []
-        for i in range(size):
-            columns = force_columns(data, i, None)
-            first, x = columns["terms"].shape[1], np.hstack(list(columns.values()))[:, None]
-            friction = [[first + i, first + n + i, first + 2 * n + i]]
-            own = ([i], friction, [1 + 4 * n + i]) if size == n else ()
-            equations.append(_equation(data, x, data.u[:, [i]], [u.columns[i]], window, *own))
-    rows, sides, count = equations[0].x.shape
-    if rows * sides < _PER_TERM * count:
-        return None
-    exact = bodies is not None and size == n
-    return Motion(data, equations, numbers, 0 < size <= n, exact)
+        columns = force_columns(data, 0, None)
+        friction, damping = columns["terms"].shape[1] + joint + [0, n, 2 * n], 1 + 4 * n + joint
+        x = _for_each(np.hstack(list(columns.values())), size)
+    if size < n:
+        friction = damping = np.zeros((size, 0), dtype=int)
+    return _equation(data, x, data.u, u.columns, window, shared, True, friction, damping)
 
 
 def _equation(
@@ -330,27 +270,38 @@ def _equation(
     y: np.ndarray,
     labels: Sequence[str],
     window: np.ndarray,
-    joints: Sequence[int] | None = None,
-    friction: Sequence[Sequence[int]] = (),
-    damping: Sequence[int] = (),
-) -> Equation:
+    shared: bool,
+    of_forces: bool,
+    friction: np.ndarray,
+    damping: np.ndarray,
+) -> Equation | None:
+    rows, sides, count = x.shape
+    if rows * (sides if shared else 1) < _PER_TERM * count:
+        return None
+    numbers, window = np.unique(window, return_inverse=True)
     y = y - np.median(y, axis=0)
-    return Equation(data, x, y, labels, window, joints, friction, damping)
+    return Equation(data, x, y, labels, window, numbers, shared, of_forces, friction, damping)
 
 
-def _of_states(data: Averages, q: Columns, window: np.ndarray) -> list[Equation]:
-    """Return equations of v or of a, whichever leaves less; of a without inputs."""
+def _for_each(x: np.ndarray, sides: int) -> np.ndarray:
+    """Return columns ``(R, P)`` for each left side, ``(R, K, P)``."""
+    return np.broadcast_to(x[:, None], (len(x), sides, x.shape[1]))
+
+
+def _of_states(data: Averages, q: Columns, window: np.ndarray) -> Equation | None:
+    """Return the equation of v or of a, whichever leaves less; of a without inputs."""
     inputs = (data.u - data.u.mean(axis=0)) / data.u.std(axis=0).clip(min=1e-300)
     forms, results = [("increments", data.v), ("acceleration", data.a)], []
+    none = np.zeros((len(q.columns), 0), dtype=int)
     for form, y in forms[data.u.shape[1] == 0 :]:
-        x = np.hstack([terms(data, form), inputs])[:, None]
-        pairs = zip(y.T[:, :, None], q.columns, strict=True)
-        results.append([_equation(data, x, side, [label], window) for side, label in pairs])
-    return min(results, key=lambda x: np.median([e.usual() for e in x]))
+        x = _for_each(np.hstack([terms(data, form), inputs]), y.shape[1])
+        equation = _equation(data, x, y, q.columns, window, False, False, none, none)
+        results += [] if equation is None else [equation]
+    return min(results, key=lambda x: np.median(x.usual()), default=None)
 
 
 def check_runs(
-    narrow: Motion | None, wide: Motion | None, names: Sequence[str], *, exact: bool = True
+    narrow: Equation | None, wide: Equation | None, names: Sequence[str], *, exact: bool = True
 ) -> tuple[list[Measurement], list[Interval]]:
     """Compare the windows of each run with the equation of the others.
 
@@ -368,12 +319,12 @@ def check_runs(
     """
     if narrow is None or wide is None:
         return [], []
-    usual = narrow.usual()
-    residual, rows = narrow.residual(), narrow.window
+    usual, rows = narrow.usual(), narrow.window
+    residual = narrow.residual(narrow.theta)
     odd = residual > _RATIO * usual
     if odd.any():
         both = np.isin(narrow.numbers, wide.numbers)
-        smooth = wide.residual()[np.isin(wide.numbers, narrow.numbers)]
+        smooth = wide.residual(wide.theta)[np.isin(wide.numbers, narrow.numbers)]
         growth = (smooth + 1e-12) / (residual[both] + 1e-12)
         growth = growth if wide.data.width > narrow.data.width else 1 / growth
         odd[both] &= growth < _OF_WIDTH
@@ -383,7 +334,8 @@ def check_runs(
     results, parts = [], []
     for k in np.unique(runs[odd.any(axis=1)]) if share < 1 - _AGREE else ():
         # A motion that no other run has may be extrapolated badly: include it in the fit.
-        bad = odd & (runs == k)[:, None] & (narrow.residual(k) > _RATIO / 1.5 * usual)
+        theta = narrow.fitted(np.where(runs == k, 1.0, narrow.weights))
+        bad = odd & (runs == k)[:, None] & (narrow.residual(theta) > _RATIO / 1.5 * usual)
         bad &= _in_a_row(bad)
         if not bad.any():
             continue
@@ -392,7 +344,7 @@ def check_runs(
         all_odd = odd[rows, j] & (narrow.data.run == k)
         cause = _cause(narrow, bad[rows, j], j) or _cause(narrow, all_odd, j)
         times = narrow.data.t[bad[rows, j]]
-        if not cause and not (exact and narrow.exact and _certain(narrow, bad, odd)):
+        if not cause and not (exact and narrow.shared and _certain(narrow, bad, odd)):
             continue
         text = (
             f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
@@ -407,7 +359,7 @@ def check_runs(
     return results or [judged(RESIDUAL, "all runs", largest, expected, False, "")], parts
 
 
-def _certain(motion: Motion, bad: np.ndarray, odd: np.ndarray) -> bool:
+def _certain(motion: Equation, bad: np.ndarray, odd: np.ndarray) -> bool:
     """Tell whether four bad windows are in a row, and most odd rows are at poses of others.
 
     Else a force that depends on the position may explain them, such as that of a hose, unless all
@@ -422,7 +374,7 @@ def _certain(motion: Motion, bad: np.ndarray, odd: np.ndarray) -> bool:
 
 
 def check_rests(
-    narrow: Motion | None, wide: Motion | None, names: Sequence[str]
+    narrow: Equation | None, wide: Equation | None, names: Sequence[str]
 ) -> tuple[list[Measurement], list[Interval]]:
     """Find parts in which all joints rest, although the inputs exceed their dry friction.
 
@@ -443,19 +395,17 @@ def check_rests(
     return [judged(HELD, names[first.run], seconds, "0", True, text)], parts
 
 
-def _held_parts(motion: Motion | None) -> list[Interval]:
+def _held_parts(motion: Equation | None) -> list[Interval]:
     """Return rests in which an input exceeds the dry friction at poses of other motions."""
-    if motion is None or motion.equations[0].joints is None:
+    if motion is None or not motion.of_joints:
         return []
-    data = motion.data
-    pushed, moving = np.zeros(len(data), dtype=bool), data.moving.any(axis=1)
-    for equation in motion.equations:
-        if (~equation.resting).sum() < _PER_TERM * equation.x.shape[2]:
-            return []
-        left = np.abs(equation.y - equation.predicted())
-        level = _RATIO / 2 * equation.friction_level(equation.theta)
-        usual = np.median(left[moving], axis=0)
-        pushed |= (equation.resting & (left > level + _RATIO * usual)).any(axis=1)
+    data, moving = motion.data, motion.data.moving.any(axis=1)
+    if (~motion.resting).sum() < _PER_TERM * motion.x.shape[2]:
+        return []
+    left = np.abs(motion.y - motion.predicted())
+    level = _RATIO / 2 * motion.friction_level(motion.theta)
+    usual = np.median(left[moving], axis=0)
+    pushed = (motion.resting & (left > level + _RATIO * usual)).any(axis=1)
     low, high = data.q[moving].min(axis=0), data.q[moving].max(axis=0)
     pushed &= ~moving & ((data.q >= low) & (data.q <= high)).all(axis=1)
     edges = np.flatnonzero(np.diff(np.r_[False, pushed, False])).reshape(-1, 2)
@@ -470,7 +420,7 @@ def _in_a_row(bad: np.ndarray) -> np.ndarray:
     return before | after
 
 
-def _cause(motion: Motion, rows: np.ndarray, j: int) -> str:
+def _cause(motion: Equation, rows: np.ndarray, j: int) -> str:
     """Return the likely cause in rows whose left side j does not fit; "" if none fits."""
     data, labels, inverse = motion.data, motion.labels, motion.of_forces
     inputs = range(data.u.shape[1])
@@ -482,7 +432,7 @@ def _cause(motion: Motion, rows: np.ndarray, j: int) -> str:
             if not np.median(values):
                 return f"input {i + 1} is 0 there although the robot moves: is it moved by hand?"
             return f"input {i + 1} is constant there: is a sensor stuck?"
-    measured, predicted = motion.measured(), motion.predicted()
+    measured, predicted = motion.y, motion.predicted()
     name = f"{labels[j]!r}"
     if inverse:
         left = np.abs(measured - predicted)
@@ -494,18 +444,15 @@ def _cause(motion: Motion, rows: np.ndarray, j: int) -> str:
                 x for x, a, b in zip(labels, without, usual, strict=True) if a < _RATIO * b
             )
             return f"the motion is that without input: {idle} do not act there, is the drive off?"
-        friction = np.hstack([x.dissipation() for x in motion.equations])
+        friction = motion.part(np.hstack([motion.friction, motion.damping]))
         forwards = np.abs(measured - predicted + 2 * friction)[rows]
         if (np.median(forwards, axis=0) < np.median(left[rows], axis=0) / _RATIO).all():
             return "its friction pushes forwards there: does the time run backwards?"
     elif not inputs:
         return ""
     else:
-        equation = motion.equations[j]
-        effect = equation.x[:, 0, -len(inputs) :] @ equation.theta[-len(inputs) :]
-        measured = measured - predicted
-        measured[:, j] += effect
-        predicted = np.tile(effect[:, None], len(labels))
+        effect = motion.part(np.tile(-1 - np.arange(len(inputs)), (len(labels), 1)))
+        measured, predicted = measured - predicted + effect, effect
         name = f"the effect of the inputs on {labels[j]!r}"
     # The mean of a torque in another unit is far from that of the other runs.
     measured, predicted = (x[rows] - x[rows].mean(axis=0) for x in (measured, predicted))

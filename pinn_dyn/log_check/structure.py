@@ -19,8 +19,8 @@ from pinn_dyn.log_check.equation import (
     Regressor,
     force_columns,
     tenths,
+    unexplained,
 )
-from pinn_dyn.log_check.numbers import unexplained
 from pinn_dyn.models.structure import Structure
 from pinn_dyn.systems import RigidChain
 
@@ -38,9 +38,8 @@ _UNKNOWN = (
     "explains it; check the kinematics (lengths, axes, order of the joints) and the columns"
 )
 _ROWS = 1500  # of the comparison
-_FEW, _BEST = 300, 5  # rows that causes are tried on; causes that are judged on held-out data
+_FEW = 300  # rows that causes are tried on
 _TRIED = 3  # inputs with the largest residuals that causes have to explain
-_WHITE = 0.8  # residual with a wide kernel over that with a narrow one, of noise
 _ANGLES = np.linspace(-np.pi, np.pi, 12, endpoint=False)  # rad, of homing offsets
 _FACTORS = [1.0, *(x**k for x in (1.4, 2.0, 3.0, 5.0, 10.0) for k in (1, -1))]  # of gears
 _TRIALS = 60  # of a factor and an offset
@@ -78,97 +77,106 @@ def regressor(structure: Structure) -> Regressor:
     return function
 
 
-def held_out(
-    data: Averages, i: int, bodies: np.ndarray | None, extra: np.ndarray | None = None
-) -> tuple[np.ndarray, float]:
-    """Return the mean squares of input i that fits to nine tenths leave of the last, ``(B,)``.
+@dataclass(frozen=True)
+class StructureFit:
+    """Comparison of what rigid bodies and a generic equation leave of each torque.
 
-    The second result is the mean square of the input. ``extra`` are more columns, ``(R, .)``.
+    Attributes:
+        data: averages with the narrow kernel.
+        left, generic: shares of the inputs that they leave, by joint.
+        suspects: joints where the bodies leave four times as much as a generic equation can.
+        bad: joints where they leave more than a generic equation does of held-out data, too.
     """
-    rows = data.moving[:, i]
-    columns = force_columns(data.rows(rows), i, None if bodies is None else bodies[rows])
-    if extra is not None:
-        columns["extra"] = extra[rows]
-    y = data.u[rows, i] - data.u[rows, i].mean()
-    regression = EquationOfMotionRegression({**columns, "y": y}, tenths(data.rows(rows)))
-    left = regression.held_out("y", list(columns))[:, 0] / np.bincount(regression.block)
-    return left, float((y**2).mean())
+
+    data: Averages
+    left: dict[int, float]
+    generic: dict[int, float]
+    suspects: set[int]
+    bad: set[int]
 
 
-def compare_structure(
-    structure: Structure, widths: Sequence[Averages], u: Columns
-) -> list[Measurement]:
-    """Compare what rigid bodies and a generic equation leave of each torque, and name the cause.
+def fit_structure(structure: Structure, widths: Sequence[Averages]) -> StructureFit | None:
+    """Compare rigid bodies and a generic equation; None for others than rigid robots.
 
     Both are fitted to nine tenths of the data and judged on the last tenth. The URDF does not fit a
     joint if it leaves four times as much as the generic equation, in most tenths, with kernels of
-    two widths. The causes that are tried are reversed joints, exchanged or coupled joints or
+    two widths.
+
+    Args:
+        structure: rigid robot with one input per joint; others are not compared.
+        widths: averages of the training with kernels of two widths, and inputs as they act.
+    """
+    size = structure.num_coordinates
+    if not isinstance(structure, RigidChain) or widths[0].u.shape[1] != size:
+        return None
+    rigid = regressor(structure)
+    thinned = [data.thinned(_ROWS) for data in widths]
+    bodies = [rigid(data.q, data.v, data.a) for data in thinned]
+    joints = np.flatnonzero(thinned[0].moving.sum(axis=0) >= FEWEST)
+    pairs = zip(thinned, bodies, strict=True)
+    shares = [[_shares(data, x, i) for i in joints] for data, x in pairs]
+    left, generic, worse = np.reshape(shares, (2, len(joints), 3)).transpose(2, 0, 1)
+    suspect = (left > _WORSE * generic).all(axis=0)
+    bad = suspect & (worse > 0).all(axis=0)
+    return StructureFit(
+        data=thinned[0],
+        left=dict(zip(joints.tolist(), left[0], strict=True)),
+        generic=dict(zip(joints.tolist(), generic[0], strict=True)),
+        suspects=set(joints[suspect].tolist()),
+        bad=set(joints[bad].tolist()),
+    )
+
+
+def _shares(data: Averages, bodies: np.ndarray, i: int) -> tuple[float, float, bool]:
+    """Return the shares of an input that rigid bodies and a generic equation leave.
+
+    The share of the bodies is that of held-out data; a generic equation can leave as little as it
+    does of the data that it is fitted to. The third result is true if the bodies leave more of
+    held-out data than a generic equation, in most tenths.
+    """
+    rows = data.moving[:, i]
+    data = data.rows(rows)
+    y = data.u[:, [i]] - data.u[:, [i]].mean(axis=0)
+    left = []
+    for x in (bodies[rows], None):
+        columns = force_columns(data, i, x)
+        regression = EquationOfMotionRegression({**columns, "y": y}, tenths(data))
+        left.append(regression.held_out("y", list(columns))[:, 0])
+    of_bodies, generic = left
+    worse = of_bodies.sum() > _WORSE * generic.sum() and (of_bodies > generic).sum() >= _TENTHS
+    return float(of_bodies.sum() / (y**2).sum()), unexplained(y, *columns.values()), bool(worse)
+
+
+def compare_structure(
+    structure: Structure, fit: StructureFit, u: Columns
+) -> tuple[list[Measurement], set[int]]:
+    """Name the cause of what rigid bodies leave; return the joints that do not fit, too.
+
+    The causes that are tried are reversed joints, exchanged or coupled joints or
     inputs, offsets and factors of q, other directions of gravity, and springs. At the other joints
     the scale s_i of the torques is compared with that of the URDF's bodies::
 
         u_i = s_i Y_i(q, v, a) pi_0 + r a_i + d v_i + c sign(v_i) - o
 
     Args:
-        structure: rigid robot with one input per joint; others are not compared.
-        widths: averages of the training with kernels of two widths, and inputs as they act.
+        structure: rigid robot.
+        fit: comparison of its bodies with a generic equation.
         u: columns of the inputs.
     """
-    if not isinstance(structure, RigidChain) or len(u.columns) != structure.num_coordinates:
-        return []
-    rigid = regressor(structure)
-    thinned = [data.thinned(_ROWS) for data in widths]
-    trials = [(data, rigid(data.q, data.v, data.a)) for data in thinned]
-    rows = [i for i in range(len(u.columns)) if thinned[0].moving[:, i].sum() >= FEWEST]
-    fits = {i: [_fit(data, bodies, i) for data, bodies in trials] for i in rows}
-    suspects = [
-        i
-        for i, (narrow, wide) in fits.items()
-        if wide.left > _WHITE * narrow.left or (narrow.suspect and wide.suspect)
-    ]
-    bad = {i for i, pair in fits.items() if all(fit.worse and fit.suspect for fit in pair)}
-    worst = sorted(suspects, key=lambda i: -fits[i][0].left)[:_TRIED]
-    hint = _explanation(structure, thinned[0], worst) if worst else ""
-    if hint:
-        bad = set(suspects)
+    assert isinstance(structure, RigidChain)
+    worst = sorted(fit.suspects, key=lambda i: -fit.left[i])[:_TRIED]
+    hint = _explanation(structure, fit.data, worst) if worst else ""
+    bad = fit.suspects if hint else fit.bad
     results = []
-    for i, pair in fits.items():
-        joint = structure.joint_names[i]
+    for i, left in fit.left.items():
+        joint, generic = structure.joint_names[i], fit.generic[i]
         text = (
-            f"the URDF leaves {100 * pair[0].left:.2g} % of {u.columns[i]!r} at joint {joint} "
-            f"unexplained, a generic equation {100 * pair[0].generic:.2g} %: {hint or _UNKNOWN}"
+            f"the URDF leaves {100 * left:.2g} % of {u.columns[i]!r} at joint {joint} "
+            f"unexplained, a generic equation {100 * generic:.2g} %: {hint or _UNKNOWN}"
         )
-        ratio = pair[0].left / max(pair[0].generic, 1e-300)
+        ratio = left / max(generic, 1e-300)
         results.append(_judged(FIT, joint, ratio, f"below {_WORSE:g}", i in bad, text))
-    return results + _scales(structure, thinned[0], u, bad)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Shares of an input that rigid bodies and a generic equation leave.
-
-    Attributes:
-        left: share of held-out data that the rigid bodies leave.
-        generic: share of the same data that a generic equation leaves, fitted to it.
-        suspect: the rigid bodies leave more than that: causes are tried.
-        worse: they leave more than a generic equation does of held-out data, in most tenths.
-    """
-
-    left: float
-    generic: float
-    suspect: bool
-    worse: bool
-
-
-def _fit(data: Averages, bodies: np.ndarray, i: int) -> _Fit:
-    """Compare the two equations of input i."""
-    left, total = held_out(data, i, bodies)
-    generic, _ = held_out(data, i, None)
-    worse = left.mean() > _WORSE * generic.mean() and (left > generic).sum() >= _TENTHS
-    rows = data.rows(data.moving[:, i])
-    columns = force_columns(rows, i, None)
-    least = unexplained(rows, rows.u[:, [i]], *columns.values())
-    share = float(left.mean() / total)
-    return _Fit(share, least, share > _WORSE * least, bool(worse))
+    return results + _scales(structure, fit.data, u, bad), bad
 
 
 def _judged(
@@ -188,17 +196,7 @@ def _left(cause: _Cause, joints: Sequence[int]) -> float:
         columns = force_columns(data, i, cause.bodies[rows])
         if cause.extra is not None and cause.extra[0] == i:
             columns["extra"] = cause.extra[1][rows].reshape(len(data), -1)
-        shares.append(unexplained(data, data.u[:, [i]], *columns.values()))
-    return float(np.sum(shares))
-
-
-def _left_of_held_out(cause: _Cause, joints: Sequence[int]) -> float:
-    """Return the sum of the shares of inputs that rigid bodies leave of held-out data."""
-    shares = []
-    for i in joints:
-        extra = cause.extra[1] if cause.extra is not None and cause.extra[0] == i else None
-        left, total = held_out(cause.data, i, cause.bodies, extra)
-        shares.append(left.mean() / max(total, 1e-300))
+        shares.append(unexplained(data.u[:, [i]], *columns.values()))
     return float(np.sum(shares))
 
 
@@ -210,18 +208,16 @@ def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -
     data = data.thinned(_FEW)
     rigid = regressor(structure)
     plain = _Cause("", data, rigid(data.q, data.v, data.a))
-    total, candidates = _left(plain, joints), []
+    total, texts = _left(plain, joints), {}
     for causes in (_causes, _offsets, _gears):
-        candidates += [(_left(x, joints), x) for x in causes(structure, plain, joints)]
-        if min(left for left, _ in candidates) < _ENOUGH * total:
+        texts |= {x.text: _left(x, joints) for x in causes(structure, plain, joints)}
+        least = min(texts.values())
+        if least < _ENOUGH * total:
             break
-    best = [x for left, x in sorted(candidates, key=lambda x: x[0])[:_BEST] if np.isfinite(left)]
-    totals = np.array([_left_of_held_out(cause, joints) for cause in best])
-    if not totals.min(initial=np.inf) < _EXPLAINS * _left_of_held_out(plain, joints):
+    if least >= _EXPLAINS * total:
         return ""
     # In a plane, the mirror image of a reversed joint is the other joint reversed.
-    ties = np.flatnonzero(totals < max(_TIE * totals.min(), 1e-6))
-    return "; or ".join(dict.fromkeys(best[k].text for k in ties))
+    return "; or ".join(text for text, left in texts.items() if left < max(_TIE * least, 1e-6))
 
 
 def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iterator[_Cause]:
