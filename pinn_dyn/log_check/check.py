@@ -141,7 +141,7 @@ class _Log:
         return [x.rows(x.stretch < len(self.training)) for x in widths]
 
     def clear_delays(self, curves: Sequence[DelayCurve]) -> list[float]:
-        """Return the delay of each input that is clear, s; 0 for others. The lag of a servo is none."""
+        """Return the clear delay of each input, s; 0 for others, as for the lag of a servo."""
         return [0.0] * len(curves) if self.servo else clear_delays(curves, self.step)
 
 

@@ -254,7 +254,7 @@ def equation_of_motion(
     if bodies is not None and shared:
         x = chain_columns(data, bodies)
         first = x.shape[2] - OWN * n + OWN * joint
-        friction, damping = first + [4, 5, 6], first + 3
+        friction, damping = first + np.array([4, 5, 6]), first + 3
     else:
         columns = force_columns(data, 0, None)
         friction, damping = columns["terms"].shape[1] + joint + [0, n, 2 * n], 1 + 4 * n + joint
