@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -206,8 +207,7 @@ def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -
     Causes that need a search are tried if simpler ones leave a part.
     """
     data = data.thinned(_FEW)
-    rigid = regressor(structure)
-    plain = _Cause("", data, rigid(data.q, data.v, data.a))
+    plain = _changed("", data, regressor(structure))
     total, texts = _left(plain, joints), {}
     for causes in (_causes, _offsets, _gears):
         texts |= {x.text: _left(x, joints) for x in causes(structure, plain, joints)}
@@ -221,66 +221,56 @@ def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -
 
 
 def _causes(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Iterator[_Cause]:
-    names, size = structure.joint_names, structure.num_coordinates
-    data, rigid = plain.data, regressor(structure)
-
-    def changed(text: str, motion: Averages, rigid: Regressor = rigid) -> _Cause:
-        return _Cause(text, motion, rigid(motion.q, motion.v, motion.a))
-
+    names, data, rigid = structure.joint_names, plain.data, regressor(structure)
     for k, name in enumerate(names):
-        reversed_k = np.where(np.arange(size) == k, -1.0, 1.0)
-        motion = _scaled(data, reversed_k)
-        q, v, a = map(torch.from_numpy, (motion.q, motion.v, motion.a))
-        forces = structure.rigid_force(q, v, a)
-        same = float((data.u[:, k] * forces[:, k].numpy()).sum()) > 0
-        columns = "q and v" if same else "q, v and u"
+        cause = _moved(plain, rigid, k, -1.0, 0.0)
+        forces = _forces(structure, cause.data)
+        columns = "q and v" if (data.u[:, k] * forces[:, k]).sum() > 0 else "q, v and u"
         text = f"joint {name} turns the other way in the log: reverse its axis, or {columns} of it"
-        yield changed(text, motion)
+        yield replace(cause, text=text)
         springs = wording.setting("model.springs", [name])
         text = f"a spring at joint {name} explains it: fit it with {springs}"
         yield replace(plain, text=text, extra=(k, data.q[:, k]))
-    for i in range(size):
-        for j in range(size):
-            pair = f"{names[j]} and {names[i]}"
-            if i != j:
-                text = (
-                    f"the input of joint {names[i]} holds the torques of the joints {pair}, as of "
-                    "a belt or a differential: convert it to torques of the joints"
-                )
-                yield replace(plain, text=text, extra=(i, plain.bodies[:, j]))
-            if j >= i:
-                continue
-            order = np.arange(size)
-            order[[i, j]] = order[[j, i]]
-            text = f"the inputs of the joints {pair} are exchanged"
-            yield replace(plain, text=text, data=replace(data, u=data.u[:, order]))
-            text = f"the columns of the joints {pair} are exchanged (q, v and u)"
-            yield changed(text, _ordered(data, order))
+    for i, j in itertools.permutations(range(len(names)), 2):
+        text = (
+            f"the input of joint {names[i]} holds the torques of the joints {names[j]} and "
+            f"{names[i]}, as of a belt or a differential: convert it to torques of the joints"
+        )
+        yield replace(plain, text=text, extra=(i, plain.bodies[:, j]))
+    for i, j in itertools.combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[[i, j]] = order[[j, i]]
+        pair = f"of the joints {names[i]} and {names[j]} are exchanged"
+        text = f"the inputs {pair}"
+        yield replace(plain, text=text, data=replace(data, u=data.u[:, order]))
+        yield _changed(f"the columns {pair} (q, v and u)", _ordered(data, order), rigid)
     setting = wording.setting("model.structure.gravity", [0.0, 0.0, 0.0])
     text = (
         "gravity is missing in the log, as in torques before its compensation is added: log the "
         f"torques that act, or set {setting}"
     )
-    weightless = changed(text, data, regressor(structure.with_gravity([0.0, 0.0, 0.0])))
+    weightless = _changed(text, data, regressor(structure.with_gravity([0.0, 0.0, 0.0])))
     yield weightless
     least = _left(weightless, joints)
-    magnitude = float(np.linalg.norm(structure.gravity))
-    for axis in range(3):
-        for sign in (1.0, -1.0):
-            gravity = [sign * magnitude if x == axis else 0.0 for x in range(3)]
-            setting = wording.setting("model.structure.gravity", gravity)
-            text = f"the base is mounted otherwise: set {setting}"
-            cause = changed(text, data, regressor(structure.with_gravity(gravity)))
-            if _left(cause, joints) < least / _TIE:  # gravity along an axis has no torque
-                yield cause
+    for direction in np.vstack([np.eye(3), -np.eye(3)]):
+        gravity = (float(np.linalg.norm(structure.gravity)) * direction + 0.0).tolist()
+        setting = wording.setting("model.structure.gravity", gravity)
+        bodies = regressor(structure.with_gravity(gravity))
+        cause = _changed(f"the base is mounted otherwise: set {setting}", data, bodies)
+        if _left(cause, joints) < least / _TIE:  # gravity along an axis has no torque
+            yield cause
+
+
+def _changed(text: str, data: Averages, rigid: Regressor) -> _Cause:
+    """Return the cause that the log or the robot is another one."""
+    return _Cause(text, data, rigid(data.q, data.v, data.a))
 
 
 def _moved(plain: _Cause, rigid: Regressor, k: int, factor: float, offset: float) -> _Cause:
     """Return the cause that q of joint k is a multiple of that of the robot, plus an offset."""
     k_alone = np.arange(plain.data.q.shape[1]) == k
     motion = _scaled(plain.data, np.where(k_alone, 1 / factor, 1.0))
-    motion = replace(motion, q=motion.q + offset * k_alone)
-    return replace(plain, data=motion, bodies=rigid(motion.q, motion.v, motion.a))
+    return _changed("", replace(motion, q=motion.q + offset * k_alone), rigid)
 
 
 def _offset(
@@ -339,11 +329,6 @@ def _gears(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Itera
         starts.append((least, k, factor, offset))
     _, k, factor, offset = min(starts)
     start = np.array([np.log(factor), offset])
-    alone = scipy.optimize.minimize_scalar(
-        lambda x: left(k, np.exp(x), 0.0),
-        bounds=(start[0] - 0.3, start[0] + 0.3),
-        method="bounded",
-    )
     both = scipy.optimize.minimize(
         lambda x: left(k, np.exp(x[0]), x[1]),
         start,
@@ -354,8 +339,8 @@ def _gears(structure: RigidChain, plain: _Cause, joints: Sequence[int]) -> Itera
         },
     )
     factor, offset = np.exp(both.x[0]), both.x[1]
-    if alone.fun <= max(_TIE * both.fun, 1e-6):
-        factor, offset = np.exp(alone.x), 0.0
+    if left(k, factor, 0.0) <= max(_TIE * both.fun, 1e-6):
+        offset = 0.0
     name = structure.joint_names[k]
     text = f"q and v of joint {name} are {factor:.3g} times those of the URDF, as by a gear"
     if offset:
@@ -389,6 +374,12 @@ def _ordered(data: Averages, order: np.ndarray) -> Averages:
     )
 
 
+def _forces(structure: RigidChain, data: Averages) -> np.ndarray:
+    """Return the forces of the bodies of the URDF, ``(R, N)``."""
+    motion = map(torch.from_numpy, (data.q, data.v, data.a))
+    return np.asarray(structure.rigid_force(*motion).numpy())
+
+
 def _scales(
     structure: RigidChain, data: Averages, u: Columns, bad: Collection[int]
 ) -> list[Measurement]:
@@ -396,8 +387,7 @@ def _scales(
     forces = set(u.units) <= {"Nm", "N"}
     if not (forces or set(u.units) <= {"A"}) or structure.tree.problems:
         return []
-    q, v, a = map(torch.from_numpy, (data.q, data.v, data.a))
-    forces_of_bodies = structure.rigid_force(q, v, a).numpy()
+    forces_of_bodies = _forces(structure, data)
     results = []
     for i, joint in enumerate(structure.joint_names):
         rows = data.moving[:, i]
