@@ -26,7 +26,6 @@ from pinn_dyn.log_check.equation import (
     GROUPS,
     EquationOfMotionRegression,
     Regressor,
-    bodies,
     force_columns,
     tenths,
     terms,
@@ -40,7 +39,7 @@ _WORSE = 2.0  # residual over that of the best equation of motion, beyond which 
 FEWEST = 20 * GROUPS
 """Smallest number of rows of a regression."""
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
-_INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
+_INVERSE, _RIGID, _OF_STATES = "inverse dynamics", "rigid bodies", ("increments", "acceleration")
 _ONE_LINE = 0.995  # of the power of a signal
 INTERVAL = 2.26
 """Half width of a 95 % interval in units of the jackknife's spread (Student, 9 degrees)."""
@@ -122,24 +121,23 @@ def input_delays(
     if not trials:
         ones, short = np.ones(len(candidates)), "the stretches are too short"
         return [DelayCurve(candidates, ones, None, np.inf, "none", short)] * inputs
-    forms: dict[str, list[list[DelayCurve]]] = {}
-    for data in trials:
-        for form, curves in _curves(data, inputs, rigid, candidates).items():
-            forms.setdefault(form, []).append(curves * (inputs // len(curves)))
-    best = {
-        form: [_best(curves) for curves in zip(*trials, strict=True)]
-        for form, trials in forms.items()
-    }
-    of_bodies = best.pop(_RIGID, None)
-    curves = _agreed(list(best.values()), step)
-    if of_bodies is not None:
-        pairs = zip(curves, of_bodies, strict=True)
-        curves = [_better(generic, rigid_curve, step) for generic, rigid_curve in pairs]
+    if inputs > size:
+        forms = [[_motion_curve(data, form, candidates) for data in trials] for form in _OF_STATES]
+        curves = [_agreed([_best(x) for x in forms], step)] * inputs
+    else:
+        regressors = [[None] * len(trials)]
+        if rigid is not None and inputs == size:
+            regressors.append([rigid(x.q, x.v, x.a) for x in trials])
+        curves = []
+        for i in range(inputs):
+            forms = [
+                [_input_curve(data, i, y, candidates) for data, y in zip(trials, x, strict=True)]
+                for x in regressors
+            ]
+            curves.append(_agreed([_best(x) for x in forms], step))
     for i in range(inputs):
         signals = [item.u[:, i] for item in recordings]
-        if not any(np.ptp(x) for x in signals):
-            curves[i] = curves[i].without("the input is constant")
-        elif all(_is_sine(x) for x in signals):
+        if all(_is_sine(x) for x in signals):
             reason = "the input is a single sine, whose delay looks like damping"
             curves[i] = curves[i].without(reason)
     return curves
@@ -173,69 +171,38 @@ def are_held(curves: Sequence[DelayCurve], step: float) -> bool:
     return len(delays) > 0 and bool((np.abs(delays - step / 2) + widths < step / 4).all())
 
 
-def _better(generic: DelayCurve, rigid: DelayCurve, step: float) -> DelayCurve:
-    """Return the curve of rigid bodies if it has a delay, with the generic one if they differ."""
-    best, other = (rigid, generic) if not rigid.reason else (generic, rigid)
-    places = [minimum(x.candidates, x.residual) for x in (best, other)]
-    differ = other.form != best.form and abs(places[0] - places[1]) > step
-    return replace(best, other=other if differ else None)
+def _agreed(curves: Sequence[DelayCurve], step: float) -> DelayCurve:
+    """Return the curve of the clearest equation, without a delay that an equally good one denies.
 
-
-def _agreed(forms: Sequence[list[DelayCurve]], step: float) -> list[DelayCurve]:
-    """Return the curves of the clearest equation, without delays that an equally good one denies.
-
-    A delay makes up for terms that a worse equation of motion lacks, such as inertia.
+    A delay makes up for terms that a worse equation of motion lacks, such as inertia or a force
+    that the bodies of a URDF lack. With a delay, that of the bodies counts first.
     """
-    left = [np.mean([x.residual.min() for x in curves]) for curves in forms]
-    good = [x for x, share in zip(forms, left, strict=True) if share <= _WORSE * min(left)]
-    curves = min(good, key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
-    for alternative in good:
-        for k, (x, y) in enumerate(zip(curves, alternative, strict=True)):
-            width = step + INTERVAL * np.hypot(x.spread, y.spread)
-            if x.delay is not None and y.delay is not None and abs(x.delay - y.delay) > width:
-                reason = f"{x.form} and {y.form} disagree, {x.delay:.3g} and {y.delay:.3g} s"
-                curves[k] = replace(x, delay=None, reason=reason)
-    return curves
+    least = min(x.residual.min() for x in curves)
+    good = [x for x in curves if x.residual.min() <= _WORSE * least]
+    best = min(good, key=lambda x: (x.delay is None, not x.of_bodies, x.spread))
+    if best.delay is not None and not best.of_bodies:
+        for other in (x for x in good if x.delay is not None):
+            width = step + INTERVAL * np.hypot(best.spread, other.spread)
+            if abs(best.delay - other.delay) > width:
+                return best.without(f"{best.form} and {other.form} disagree")
+    place = minimum(best.candidates, best.residual)
+    others = [x for x in curves if abs(minimum(x.candidates, x.residual) - place) > step]
+    return replace(best, other=others[0] if others else None)
 
 
 def _best(curves: Sequence[DelayCurve]) -> DelayCurve:
     """Return the clearest curve; its spread includes kernels of other widths that are as clear."""
-    best = min(curves, key=_rank)
+    best = min(curves, key=lambda x: (x.delay is None, x.spread))
     clear = [x for x in curves if x.spread <= 2 * best.spread]
     width = np.std([minimum(x.candidates, x.residual) for x in clear])
     return replace(best, spread=float(np.hypot(best.spread, width)))
 
 
-def _rank(curve: DelayCurve) -> tuple[bool, float]:
-    return curve.delay is None, min(curve.spread, 1.0)
-
-
 def _is_sine(x: np.ndarray) -> bool:
     power = np.abs(np.fft.rfft((x - x.mean()) * np.hanning(len(x)))) ** 2
     peak = int(power.argmax())
-    return bool(power[max(peak - 2, 0) : peak + 3].sum() >= _ONE_LINE * power.sum())
-
-
-def _curves(
-    data: Averages, inputs: int, rigid: Regressor | None, candidates: np.ndarray
-) -> dict[str, list[DelayCurve]]:
-    """Return a curve of each input in each form of the equation; or one for all inputs."""
-    size = data.q.shape[1]
-    if inputs > size:
-        return {
-            form: [_motion_curve(data, form, motion, candidates)]
-            for form, motion in (("increments", data.v), ("acceleration", data.a))
-        }
-    forms = {_INVERSE: [_input_curve(data, i, None, candidates) for i in range(inputs)]}
-    regressor = bodies(data, rigid) if inputs == size else None
-    if regressor is not None:
-        curves = [_input_curve(data, i, regressor, candidates) for i in range(inputs)]
-        for i, generic in enumerate(forms[_INVERSE]):
-            if curves[i].residual.min() > _WORSE * generic.residual.min():
-                # A delay would make up for a force that the bodies lack.
-                curves[i] = replace(generic, form=_INVERSE)
-        forms[_RIGID] = curves
-    return forms
+    line = power[max(peak - 2, 0) : peak + 3].sum()
+    return bool(np.ptp(x) > 0 and line >= _ONE_LINE * power.sum())
 
 
 def _input_curve(
@@ -261,10 +228,9 @@ def _input_curve(
     return _curve(candidates, shares, friction, form)
 
 
-def _motion_curve(
-    data: Averages, form: str, motion: np.ndarray, candidates: np.ndarray
-) -> DelayCurve:
-    """Return the curve of all inputs by v or a ``(R, N)``."""
+def _motion_curve(data: Averages, form: str, candidates: np.ndarray) -> DelayCurve:
+    """Return the curve of all inputs by v or a."""
+    motion = data.v if form == "increments" else data.a
     spread = motion.std(axis=0).clip(min=1e-300)
     columns = {"terms": terms(data, form), "motion": (motion - motion.mean(axis=0)) / spread}
     times = data.t[:, None] - candidates

@@ -21,12 +21,11 @@ SATURATED = "saturated samples"
 _ROWS = 2500  # of the regression
 _LARGEST_DRIFT = 0.05
 _SHIFT = 0.02  # distance of candidates at the end of a run, s
-_FINER = 21  # candidates around the best one
 _LONGEST = 60.0  # s of a run that are used
 _CONSTANT = np.arange(-0.1, 0.11, 0.02)  # s, constant shifts that are tried beside the best delay
 SATURATES = "is a command that its drive cannot follow"
 """Words of the finding that a model with limits of its drives accounts for."""
-_QUANTILES = np.linspace(0.3, 0.97, 24)  # of |u|, for saturation
+_QUANTILES = np.linspace(0.5, 0.97, 20)  # of |u|, for saturation
 _LESS = 0.5  # residual over that of a constant delay, below which a fault is clear
 _SMALL, _CLEAR = 1e-3, 0.2  # residuals: too small to matter; small enough to trust
 
@@ -88,47 +87,31 @@ def _faults(
         Measurements, the curves without the delays of these inputs, and for each input the rows
         between the updates that lines have to join, or 1.
     """
-    size, inputs = data.q.shape[1], len(curves)
-    if not inputs or inputs > size:
-        return [], list(curves), [1] * inputs
+    results, changed, held = [], list(curves), [1] * len(curves)
+    if len(curves) > data.q.shape[1]:
+        return results, changed, held
     ends = {k: data.passed[data.run == k].max() for k in np.unique(data.run)}
     # The end of a run has no input of a clock that is slow.
     last = np.array([ends[k] for k in data.run])
     inside = (data.passed < _LONGEST) & (data.passed * (1 + _LARGEST_DRIFT) <= last)
-    duration = float(data.passed[data.passed < _LONGEST].max())
-    half = np.arange(1, int(_LARGEST_DRIFT * duration / _SHIFT) + 1) * _SHIFT / max(duration, 1e-9)
-    drifts = np.concatenate([-half[::-1], half])
     used = data.rows(inside).thinned(_ROWS)
     regressor = bodies(used, rigid)
-    results, changed, held = [], list(curves), [1] * inputs
     for i, (name, unit) in enumerate(zip(u.columns, u.units, strict=True)):
         moving = used.moving_rows(i)
         drift, level, share = 0.0, np.inf, 0.0
         rows = max((held_rows(x.u[:, [i]]) for x in data.recordings), default=1)
-        held[i] = 1
         if moving.sum() >= FEWEST:
             trial = _trial(used.rows(moving), i, curves[i], regressor, moving)
-            times = trial.data.t[:, None]
-            shift = drifts * trial.data.passed[:, None]
-            constant = trial.shares(trial.data.input_at(i, times - [trial.delay, *_CONSTANT])).min()
+            shifts = trial.data.t[:, None] - [trial.delay, *_CONSTANT]
+            constant = trial.shares(trial.data.input_at(i, shifts)).min()
             if unexplained is not None:
                 constant = min(constant, unexplained[i])
-            drifting = trial.data.input_at(i, times + shift)
-            of_drifts = trial.shares(drifting) if len(drifts) else np.ones(1)
-            best = min(_LESS * constant, _CLEAR)
-            if constant > _SMALL and of_drifts.min() < best:
-                coarse = drifts[of_drifts.argmin()]
-                near = coarse + np.linspace(-1, 1, _FINER) * (drifts[-1] - drifts[-2])
-                finer = trial.shares(
-                    trial.data.input_at(i, times + near * trial.data.passed[:, None])
-                )
-                drift, best = minimum(near, finer), float(of_drifts.min())
             if rows > 1 and _follows_lines(trial, i):
-                held[i], drift = rows, 0.0
-            if constant > _SMALL and held[i] == 1:
-                level, share = _saturation(trial, i, best)
-                drift = 0.0 if share else drift
-        longest = max(duration, *(x.t[-1] - x.t[0] for x in data.recordings))
+                held[i] = rows
+            elif constant > _SMALL:
+                level, share = _saturation(trial, i)
+                drift = 0.0 if share else _drift(trial, i, min(_LESS * constant, _CLEAR))
+        longest = max(x.t[-1] - x.t[0] for x in data.recordings)
         text = (
             f"the clock of input {name!r} drifts by {100 * abs(drift):.2g} % against that of q: at "
             f"{longest:.3g} s it is {abs(drift) * 1e3 * longest:.3g} ms too "
@@ -148,9 +131,10 @@ def _faults(
             "motion follows lines between them: add the step below to the data set"
         )
         results.append(judged(HELD, name, rows, "1", held[i] > 1, text))
-        reasons = {"the drive saturates": share > 0, "the input is held": held[i] > 1}
-        for reason in (text for text, holds in reasons.items() if holds):
-            changed[i] = curves[i].without(reason)
+        if share:
+            changed[i] = curves[i].without("the drive saturates")
+        if held[i] > 1:
+            changed[i] = curves[i].without("the input is held")
         if drift:
             reason = "the clock of the inputs drifts"
             changed = [x.without(x.reason or reason) for x in changed]
@@ -165,6 +149,15 @@ def _trial(
         columns["spring"] = data.q[:, [i]]
     delay = float(curve.candidates[int(curve.residual.argmin())])
     return _Trial(data, np.column_stack(list(columns.values())), delay)
+
+
+def _drift(trial: _Trial, i: int, limit: float) -> float:
+    """Return the drift of the clock that leaves least; 0 if it leaves more than a limit."""
+    passed = trial.data.passed
+    count = max(int(_LARGEST_DRIFT * passed.max() / _SHIFT), 1)
+    drifts = np.arange(-count, count + 1) * _SHIFT / passed.max()
+    shares = trial.shares(trial.data.input_at(i, trial.data.t[:, None] + drifts * passed[:, None]))
+    return minimum(drifts, shares) if shares.min() < limit else 0.0
 
 
 def _follows_lines(trial: _Trial, i: int) -> bool:
@@ -184,7 +177,7 @@ def _follows_lines(trial: _Trial, i: int) -> bool:
     return bool(trial.shares(joined).min() < _LESS * trial.shares(held).min())
 
 
-def _saturation(trial: _Trial, i: int, best: float) -> tuple[float, float]:
+def _saturation(trial: _Trial, i: int) -> tuple[float, float]:
     """Return the level of a saturation and the share of the samples beyond it; inf and 0 if none.
 
     The equation is fitted to u limited to +-c. It must leave less of the force than that of u, on
