@@ -250,11 +250,6 @@ class Order(NamedTuple):
     signs: np.ndarray
     unexplained: np.ndarray
 
-    @property
-    def exchanged(self) -> bool:
-        """True if inputs are exchanged."""
-        return any(x.name == EXCHANGED and x.verdict != "ok" for x in self.measurements)
-
     def corrected(self, data: Averages) -> Averages:
         """Return averages with the inputs of the joints in turn, and their signs."""
         order = np.argsort(self.joints)

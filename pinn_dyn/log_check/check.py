@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,7 +39,7 @@ from pinn_dyn.log_check.delay import (
 )
 from pinn_dyn.log_check.equation import Regressor
 from pinn_dyn.log_check.figures import residuals
-from pinn_dyn.log_check.input_faults import SATURATED, input_faults
+from pinn_dyn.log_check.input_faults import DRIFT, HELD, SATURATED, input_faults
 from pinn_dyn.log_check.numbers import check_angles, check_velocity_lag
 from pinn_dyn.log_check.page import LogCheck, store, stored
 from pinn_dyn.log_check.runs import (
@@ -83,11 +83,10 @@ def verdict(source: logs.LogSource, structure: Structure | None = None) -> list[
 
     Without a check, a log with a structure is checked now; the result is empty for others.
     """
-    texts = stored(source, _regressor(structure, len(source.u.columns)))
-    if texts is None and structure is not None:
+    rigid = _Log(source, structure).rigid
+    if stored(source, rigid) is None and structure is not None:
         check(source, structure=structure)
-        texts = stored(source, _regressor(structure, len(source.u.columns)))
-    return texts or []
+    return stored(source, rigid) or []
 
 
 def residual_figure(source: logs.LogSource, structure: Structure) -> Figure | None:
@@ -95,16 +94,12 @@ def residual_figure(source: logs.LogSource, structure: Structure) -> Figure | No
 
     The result is None with another number of inputs than joints, or with too few rows.
     """
-    rigid = _regressor(structure, len(source.u.columns))
-    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
-    if rigid is None or training[0].u.shape[1] != len(source.u.columns):
-        return None
-    step = float(np.median(np.diff(training[0].t)))
-    widths = averages_of_widths(parts_of(training, step), step)
+    log = _Log(source, structure)
+    widths = [] if log.rigid is None else log.of_training(log.widths)
     if not widths:
         return None
     data = widths[compared(widths)[0]]
-    motion = equation_of_motion(data, source.q, source.u, data.width, rigid)
+    motion = equation_of_motion(data, source.q, source.u, data.width, log.rigid)
     return None if motion is None else residuals(motion, source.q, source.v, source.u)
 
 
@@ -115,30 +110,65 @@ class _Log:
     Attributes:
         source: the log.
         structure: kinematics of its robot, or None.
-        rigid: regressor of a robot with an input per joint, or None.
-        training, others: stretches of the training, and of validation and test.
-        step: sample time, s.
         longest_delay: longest delay of an input that is tried, s.
-        servo: the inputs are targets of servos.
     """
 
     source: logs.LogSource
     structure: Structure | None
-    rigid: Regressor | None
-    training: Sequence[logs.Recording]
-    others: Sequence[logs.Recording]
-    step: float
-    longest_delay: float
-    servo: bool
+    longest_delay: float = 0.3
+
+    @cached_property
+    def training(self) -> list[logs.Recording]:
+        """Stretches of the training."""
+        return self._stretches("train")
+
+    def _stretches(self, *splits: str) -> list[logs.Recording]:
+        inputs, parts = len(self.source.u.columns), self.source.cleaned
+        stretches = [item for x in parts if x.split in splits for item in x.clean]
+        return [replace(item, u=item.u[:, :inputs]) for item in stretches]  # no rates of inputs
+
+    @cached_property
+    def step(self) -> float:
+        """Sample time, s."""
+        return float(np.median(np.diff(self.training[0].t)))
 
     @property
     def square(self) -> bool:
         """True for an input per coordinate."""
         return len(self.source.u.columns) == len(self.source.q.columns)
 
+    @cached_property
+    def rigid(self) -> Regressor | None:
+        """Regressor of a robot with an input per joint, or None."""
+        inputs = len(self.source.u.columns)
+        if self.structure is None or self.structure.num_coordinates != inputs:
+            return None
+        return regressor(self.structure)
+
+    @cached_property
+    def servo(self) -> bool:
+        """True if the inputs are targets that the coordinates follow."""
+        units = self.source.q.units
+        if self.source.u.units[: len(units)] != units:
+            return False
+        return numbers.target_distance(self.training, self.step, self.longest_delay) < _TARGET
+
+    @cached_property
+    def parts(self) -> list[logs.Recording]:
+        """Stretches of the training, or parts of long ones."""
+        return parts_of(self.training, self.step)
+
+    @cached_property
+    def widths(self) -> list[Averages]:
+        """Averages of all stretches with kernels of a few widths."""
+        everything = [*self.parts, *parts_of(self._stretches("validation", "test"), self.step)]
+        if len(self.source.u.columns) > len(self.source.q.columns):
+            everything = [with_products(item) for item in everything]
+        return averages_of_widths(everything, self.step)
+
     def of_training(self, widths: Sequence[Averages]) -> list[Averages]:
         """Return the averages of the training."""
-        return [x.rows(x.stretch < len(self.training)) for x in widths]
+        return [x.rows(x.stretch < len(self.parts)) for x in widths]
 
     def clear_delays(self, curves: Sequence[DelayCurve]) -> list[float]:
         """Return the clear delay of each input, s; 0 for others, as for the lag of a servo."""
@@ -160,7 +190,6 @@ class _Answers:
         driven: joint that each input drives, if there are fewer inputs than coordinates.
         odd: parts of runs that do not fit the others.
         of_parts: measurements of these parts.
-        saturated: a drive saturates.
     """
 
     curves: list[DelayCurve]
@@ -173,7 +202,6 @@ class _Answers:
     driven: Sequence[int] = ()
     odd: Sequence[Interval] = ()
     of_parts: Sequence[Measurement] = ()
-    saturated: bool = False
 
 
 def check(
@@ -193,27 +221,19 @@ def check(
         LogError: if the log cannot be used at all.
     """
     splits = source.load()
-    inputs = len(source.u.columns)
-    stretches = [
-        (x.split == "train", replace(item, u=item.u[:, :inputs]))  # no rates of inputs
-        for x in source.cleaned
-        for item in x.clean
-    ]
-    training = [item for is_training, item in stretches if is_training]
-    others = [item for is_training, item in stretches if not is_training]
-    step = float(np.median(np.diff(training[0].t)))
+    log = _Log(source, structure, longest_delay)
+    training, step, inputs = log.training, log.step, len(source.u.columns)
     coordinates = _coordinates(source, training, splits.test)
     noise = coordinates["noise of q"].to_numpy()
     highest = bandwidth([item.q for item in training], step, noise)
-    servo = _follows_targets(source, training, step, longest_delay)
-    rigid = _regressor(structure, inputs)
-    parts = [parts_of(items, step) for items in (training, others)]
-    rows = max(held_rows(item.q) for _, item in stretches)
-    if rows == 1:
-        answers = _answers(_Log(source, structure, rigid, *parts, step, longest_delay, servo))
-    else:  # the acceleration of held values means nothing
+    rows = max(held_rows(item.q) for x in source.cleaned for item in x.clean)
+    if rows > 1:  # the acceleration of held values means nothing
         answers = _Answers([], [0.0] * inputs, [rows] * inputs, [_held(rows, step)])
-    store(source, rigid, answers.measurements)
+    elif any(x.name == STATE and x.verdict == "stop" for x in source.measurements):
+        answers = _Answers([], [0.0] * inputs, [1] * inputs, [])
+    else:
+        answers = _answers(log)
+    store(source, log.rigid, answers.measurements)
     measurements = [*source.measurements, *answers.measurements, *_limited(coordinates)]
     excitation = None
     if structure is not None:
@@ -235,8 +255,8 @@ def check(
         delays=answers.curves,
         steps=steps,
         delay=_delay(source, answers.clear),
-        hold=source.interpolation == "linear" and not servo and are_held(answers.curves, step),
-        candidates=_candidates(source, structure, servo=servo, dry=dry, fast=bool(fast)),
+        hold=source.interpolation == "linear" and not log.servo and are_held(answers.curves, step),
+        candidates=_candidates(source, structure, servo=log.servo, dry=dry, fast=bool(fast)),
         driven=answers.driven,
         rigid=excitation,
         motion=answers.motion,
@@ -245,42 +265,38 @@ def check(
 
 def _answers(log: _Log) -> _Answers:
     """Ask the equation of motion, without the parts of runs that do not fit the others."""
-    everything = [*log.training, *log.others]
-    if len(log.source.u.columns) > len(log.source.q.columns):
-        everything = [with_products(item) for item in everything]
-    widths = averages_of_widths(everything, log.step)
-    answers = _asked(log, widths)
+    answers = _asked(log, log.widths)
     if answers.odd:
-        odd = [np.any([x.of(data) for x in answers.odd], axis=0) for data in widths]
-        again = _asked(log, [x.rows(~rows) for x, rows in zip(widths, odd, strict=True)])
-        if not again.saturated:  # parts that do not fit look like a saturation
+        odd = [np.any([x.of(data) for x in answers.odd], axis=0) for data in log.widths]
+        again = _asked(log, [x.rows(~rows) for x, rows in zip(log.widths, odd, strict=True)])
+        if not _are_bad(again.measurements, SATURATED):  # which odd parts look like
             names = {x.name for x in answers.of_parts}
             kept = [x for x in again.measurements if x.name not in names]
             answers = replace(again, measurements=[*answers.of_parts, *kept])
     if answers.late:
-        _describe(log, answers, everything)
+        _describe(log, answers)
     return answers
+
+
+def _are_bad(measurements: Sequence[Measurement], *names: str) -> bool:
+    """Tell whether a measurement of these names is not ok."""
+    return any(x.name in names and x.verdict != "ok" for x in measurements)
 
 
 def _asked(log: _Log, widths: Sequence[Averages]) -> _Answers:
     """Ask for the order, the faults and the delays of the inputs, and compare the runs."""
-    source, training = log.source, log.of_training(widths)
-    curves = input_delays(log.training, longest=log.longest_delay, rigid=log.rigid, widths=training)
+    source, rigid = log.source, log.rigid
+    training, longest = log.of_training(widths), log.longest_delay
+    curves = input_delays(log.parts, longest=longest, rigid=rigid, widths=training)
     if not widths:
         return _Answers(curves, [0.0] * len(curves), [1] * len(curves), [])
-    chosen = [widths[k] for k in compared(widths)]
-    clear = log.clear_delays(curves)
-    order = None
+    chosen, order = [widths[k] for k in compared(widths)], None
     if not log.servo:
-        order = check_order([x.delayed(clear) for x in chosen], source.u, source.q.units)
-    unexplained = None if order is None else order.unexplained
-    faults, curves, held = input_faults(
-        log.of_training(chosen), curves, source.u, log.rigid, unexplained
-    )
-    states = {x.place for x in source.measurements if x.name == STATE and x.verdict == "stop"}
-    pairs = zip(curves, source.u.columns, strict=False)
-    curves = [x.without("the input is a state") if name in states else x for x, name in pairs]
-    if order is not None and order.exchanged:
+        delays = log.clear_delays(curves)
+        order = check_order([x.delayed(delays) for x in chosen], source.u, source.q.units)
+    of_chain = None if order is None else order.unexplained
+    faults, curves, held = input_faults(log.of_training(chosen), curves, source.u, rigid, of_chain)
+    if order is not None and log.square and order.joints != sorted(order.joints):
         curves = [x.without("the inputs are exchanged") for x in curves]
     clear = log.clear_delays(curves)
     late = [x.delayed(clear) for x in chosen]
@@ -289,40 +305,37 @@ def _asked(log: _Log, widths: Sequence[Averages]) -> _Answers:
     fit = None if log.structure is None else fit_structure(log.structure, log.of_training(late))
     fits = fit is None or not fit.bad
     narrow, wide = _equations(log, late, fits)
-    answers = _Answers(curves, clear, held, [], late, narrow, fit)
-    # A fault of an input or of the clock explains runs that differ.
-    clocks = [x for x in source.measurements if x.name in (LOST, STATE)]
-    bad = {x.name for x in [*faults, *clocks] if x.verdict != "ok"}
-    if bad <= {SATURATED}:
-        names = list(dict.fromkeys(item.run for item in late[0].recordings))
-        answers.of_parts, answers.odd = check_rests(narrow, wide, names)
-        if not answers.odd:
-            of_runs, answers.odd = check_runs(narrow, wide, names, exact=fits)
-            answers.of_parts = [*answers.of_parts, *of_runs]
-    if not bad:
-        answers.measurements += [*answers.of_parts, *([] if order is None else order.measurements)]
-    answers.measurements += faults
-    answers.saturated = SATURATED in bad
+    answers = _Answers(curves, clear, held, faults, late, narrow, fit)
     if order is not None and not log.square:
         answers.driven = order.joints
+    # A fault of an input or of the clock explains runs that differ.
+    if _are_bad([*faults, *source.measurements], DRIFT, HELD, LOST):
+        return answers
+    names = list(dict.fromkeys(item.run for item in late[0].recordings))
+    answers.of_parts, answers.odd = check_rests(narrow, wide, names)
+    if not answers.odd:
+        of_runs, answers.odd = check_runs(narrow, wide, names, exact=fits)
+        answers.of_parts = [*answers.of_parts, *of_runs]
+    if not _are_bad(faults, SATURATED):
+        of_order = [] if order is None else order.measurements
+        answers.measurements = [*answers.of_parts, *of_order, *faults]
     return answers
 
 
-def _describe(log: _Log, answers: _Answers, recordings: Sequence[logs.Recording]) -> None:
+def _describe(log: _Log, answers: _Answers) -> None:
     """Add what the averages say of coordinates, inputs and the URDF to the answers."""
     source, data = log.source, answers.late[0]
     of_robot: list[Measurement] = []
     if answers.fit is not None and log.structure is not None:
         of_robot, wrong = compare_structure(log.structure, answers.fit, source.u)
         if wrong:  # whose delays are wrong, too
-            for k in wrong:
-                if answers.curves[k].of_bodies:
-                    answers.curves[k] = answers.curves[k].without(_WRONG)
+            for k in (k for k in wrong if answers.curves[k].of_bodies):
+                answers.curves[k] = answers.curves[k].without(_WRONG)
             answers.clear = log.clear_delays(answers.curves)
             answers.motion = equation_of_motion(data, source.q, source.u, data.width, log.rigid)
-    free = [False] * len(source.q.columns) if log.structure is None else _free(log.structure)
-    answers.measurements += check_angles(data, source.q, free)
+    answers.measurements += check_angles(data, source.q, _free(log))
     if source.v is not None:
+        recordings = data.recordings
         answers.measurements += check_velocity_lag(
             recordings, source.q, source.v, log.step, data.width
         )
@@ -353,17 +366,11 @@ def _equations(log: _Log, widths: Sequence[Averages], fits: bool) -> list[Equati
     return results
 
 
-def _regressor(structure: Structure | None, inputs: int) -> Regressor | None:
-    """Return the regressor of a robot with an input per joint."""
-    square = structure is not None and structure.num_coordinates == inputs
-    return regressor(structure) if structure is not None and square else None
-
-
-def _free(structure: Structure) -> list[bool]:
+def _free(log: _Log) -> list[bool]:
     """Return true for coordinates whose joints turn without end."""
-    limits = getattr(structure, "limits", None)
+    limits = getattr(log.structure, "limits", None)
     if limits is None:
-        return [False] * structure.num_coordinates
+        return [False] * len(log.source.q.columns)
     return [abs(high - low - 2 * np.pi) < 1e-6 for low, high in limits[:, :2].tolist()]
 
 
@@ -421,14 +428,6 @@ def _candidates(
         ("if they are positions or pressures of motors", ["experiment=oscillators"]),
         ("if neither holds: a black box", ["model=mlp"]),
     ]
-
-
-def _follows_targets(
-    source: logs.LogSource, training: list[logs.Recording], step: float, longest: float
-) -> bool:
-    """Tell whether the inputs are targets that the coordinates follow."""
-    same_units = source.u.units[: len(source.q.units)] == source.q.units
-    return same_units and numbers.target_distance(training, step, longest) < _TARGET
 
 
 def _inputs_measured(

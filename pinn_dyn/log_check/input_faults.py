@@ -16,6 +16,8 @@ from pinn_dyn.log_check.equation import Regressor, bodies, force_columns, solve
 
 HELD = "rows between two values of the input"
 """Name of the measurement of inputs that are slower than the log."""
+DRIFT = "clock drift [%]"
+"""Name of the measurement of clocks of the inputs."""
 SATURATED = "saturated samples"
 """Name of the measurement of commands that exceed what acts."""
 _ROWS = 2500  # of the regression
@@ -118,7 +120,7 @@ def _faults(
             f"{'late' if drift > 0 else 'early'}, which no constant delay repairs; log it with the "
             "clock of q, or correct its times"
         )
-        results.append(judged("clock drift [%]", name, 100 * abs(drift), "0", drift != 0, text))
+        results.append(judged(DRIFT, name, 100 * abs(drift), "0", drift != 0, text))
         text = (
             f"input {name!r} {SATURATES}: about {level:.2g} {unit} "
             f"act where more is logged ({100 * share:.0f} % of the samples); log the measured "
