@@ -93,7 +93,7 @@ class Averages:
         recordings: Sequence[Recording],
         step: float,
         width: float,
-        friction: Sequence[Signs] | None = None,
+        friction: Sequence[Signs],
     ) -> Averages | None:
         """Return the averages with a kernel of a width in s; None if there are too few rows.
 
@@ -101,7 +101,7 @@ class Averages:
             recordings: stretches of one sample time, in the order of their runs.
             step: sample time, s.
             width: standard deviation of the kernel, s, at least 1.5 samples.
-            friction: signs of v of each recording; None computes them.
+            friction: signs of v of each recording.
         """
         samples = max(width / step, 1.5)
         edge = int(np.ceil(CUT * samples))
@@ -115,7 +115,7 @@ class Averages:
             rows = np.arange(edge, len(item) - edge, stride)
             if len(rows) < 2:
                 continue
-            sign, slow_sign, still = signs(item.q, step) if friction is None else friction[k]
+            sign, slow_sign, still = friction[k]
             t = item.t[edge:-edge]
             u = averages(item.u, samples)[edge:-edge]
             part = {
@@ -186,14 +186,15 @@ class Averages:
         return result
 
     def averaged(
-        self, function: Callable[[Recording], np.ndarray], delay: float = 0.0
+        self, function: Callable[[Recording], np.ndarray], delays: Sequence[float] | np.ndarray
     ) -> np.ndarray:
-        """Return averages at the rows of columns ``(T, K)`` that a function makes of recordings."""
+        """Return averages of columns ``(T, K)`` of recordings, late by D delays, ``(R, D, K)``."""
         parts = []
         for k in np.unique(self.stretch):
-            item, times = self.recordings[k], self.t[self.stretch == k] - delay
+            item = self.recordings[k]
+            times = self.t[self.stretch == k][:, None] - delays
             columns = averages(function(item), self.width / self.step)
-            parts.append(np.column_stack([np.interp(times, item.t, x) for x in columns.T]))
+            parts.append(np.stack([np.interp(times, item.t, x) for x in columns.T], axis=2))
         return np.concatenate(parts)
 
     def delayed(self, delays: Sequence[float]) -> Averages:

@@ -335,10 +335,7 @@ def _describe(log: _Log, answers: _Answers) -> None:
             answers.motion = equation_of_motion(data, source.q, source.u, data.width, log.rigid)
     answers.measurements += check_angles(data, source.q, _free(log))
     if source.v is not None:
-        recordings = data.recordings
-        answers.measurements += check_velocity_lag(
-            recordings, source.q, source.v, log.step, data.width
-        )
+        answers.measurements += check_velocity_lag(data, source.q, source.v)
     (training,) = log.of_training([data])
     answers.measurements += _inputs_measured(source, training, answers.curves, answers.clear)
     answers.measurements += of_robot

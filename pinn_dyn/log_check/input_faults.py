@@ -175,7 +175,7 @@ def _follows_lines(trial: _Trial, i: int) -> bool:
 
     delays = [0.0, max(trial.delay, 0.0)]
     held = trial.data.input_at(i, trial.data.t[:, None] - delays)
-    joined = np.hstack([trial.data.averaged(lines, delay) for delay in delays])
+    joined = trial.data.averaged(lines, delays)[:, :, 0]
     return bool(trial.shares(joined).min() < _LESS * trial.shares(held).min())
 
 
@@ -188,9 +188,9 @@ def _saturation(trial: _Trial, i: int) -> tuple[float, float]:
     """
     signals = np.concatenate([item.u[:, i] for item in trial.data.recordings])
     levels = np.quantile(np.abs(signals), _QUANTILES)
-    limited = trial.data.averaged(
-        lambda item: item.u[:, [i]].clip(-levels, levels), delay=trial.delay
-    )
+    limited = trial.data.averaged(lambda item: item.u[:, [i]].clip(-levels, levels), [trial.delay])[
+        :, 0
+    ]
     logged = trial.data.input_at(i, trial.data.t[:, None] - trial.delay)
     left, left_limited = trial.residual(logged), trial.residual(limited)
     ratios = np.full(len(levels), np.inf)

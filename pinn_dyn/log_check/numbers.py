@@ -104,21 +104,19 @@ def _turns(data: Averages, k: int) -> bool:
     return in_radians < _BETTER * in_degrees and in_degrees > _EXACT
 
 
-def check_velocity_lag(
-    recordings: Sequence[Recording], q: Columns, v: Columns, step: float, width: float
-) -> list[Measurement]:
+def check_velocity_lag(data: Averages, q: Columns, v: Columns) -> list[Measurement]:
     """Measure the lag of v behind dq/dt, as that of a filter or of another clock."""
-    parts = [replace(item, u=item.v) for item in recordings if item.v is not None]
-    last = max(2, min(round(_LONGEST / step), min(map(len, parts)) // 4))
+    step, shortest = data.step, min(map(len, data.recordings))
+    last = max(2, min(round(_LONGEST / step), shortest // 4))
     lags = np.unique(np.linspace(-last, last, 2 * min(last, 20) + 1).round().astype(int))
-    data = Averages.of(parts, step, width)
-    if data is None:
-        return []
     data = data.rows((data.since >= last * step) & (data.left >= last * step))
+    if not len(data):
+        return []
+    measured = data.averaged(lambda item: np.asarray(item.v), lags * step)
     results = []
     for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
-        measured = data.input_at(k, data.t[:, None] - lags * step)
-        shares = np.array([unexplained(x, data.v[:, [k]]) for x in measured.T[:, :, None]])
+        columns = measured[:, :, [k]].swapaxes(0, 1)
+        shares = np.array([unexplained(x, data.v[:, [k]]) for x in columns])
         best = int(shares.argmin())
         # Lag l of a column means that it is read l samples earlier: a late v needs a negative one.
         lag = -lags[best] * step
