@@ -154,10 +154,9 @@ class Readings:
             self.y[:, joints, h] = u * signs
         y = (self.y * mask[:, :, None]).reshape(-1, len(self.joints))
         block = np.repeat(tenths(self.data), n)
-        regression = EquationOfMotionRegression({"x": columns, "y": y}, block)
-        counts = np.bincount(block)[:, None]
-        self.left = regression.held_out("y", ["x"]) / counts / (y**2).mean(axis=0).clip(min=1e-300)
-        self.theta = regression.fit("y", ["x"]).theta[0]
+        fit = EquationOfMotionRegression({"x": columns, "y": y}, block).fit("y", ["x"])
+        size = np.bincount(block)[:, None] * (y**2).mean(axis=0).clip(min=1e-300)
+        self.left, self.theta = fit.held_out / size, fit.theta[0]
         self.residual = self.y - self.x @ self.theta
 
     def likely(self) -> np.ndarray:

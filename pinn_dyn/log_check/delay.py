@@ -218,10 +218,9 @@ def _input_curve(
     columns = force_columns(data, i, None if regressor is None else regressor[moving])
     u = data.input_at(i, data.t[:, None] - candidates)
     regression = EquationOfMotionRegression({**columns, "u": u - u.mean(axis=0)}, tenths(data))
-    weights = regression.jackknife()
-    shares = regression.fit("u", list(columns), weights).shares()
+    shares = regression.fit("u", list(columns)).shares
     # The level of the friction is that without its rise at low speed.
-    level = regression.fit("u", ["terms", "sign"], weights).theta[:, columns["terms"].shape[1] :]
+    level = regression.fit("u", ["terms", "sign"]).theta[:, columns["terms"].shape[1] :]
     own = i if columns["sign"].shape[1] > 1 else 0
     square = data.u.shape[1] == data.q.shape[1]
     friction = level[:, own] / data.spread[i] if square else np.nan * shares
@@ -237,9 +236,8 @@ def _motion_curve(data: Averages, form: str, candidates: np.ndarray) -> DelayCur
     inputs = np.stack([data.input_at(i, times) for i in range(data.u.shape[1])], axis=2)
     columns |= {f"u{k}": inputs[:, k] for k in range(len(candidates))}
     regression = EquationOfMotionRegression(columns, tenths(data))
-    weights = regression.jackknife()
-    fits = [regression.fit("motion", ["terms", f"u{k}"], weights) for k in range(len(candidates))]
-    shares = np.stack([fit.shares().mean(axis=1) for fit in fits], axis=1)
+    fits = [regression.fit("motion", ["terms", f"u{k}"]) for k in range(len(candidates))]
+    shares = np.stack([fit.shares.mean(axis=1) for fit in fits], axis=1)
     return _curve(candidates, shares, np.full_like(shares, np.nan), form)
 
 

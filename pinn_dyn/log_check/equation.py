@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,34 +18,26 @@ _RICH = 3  # independent rows at least for a term of a rich equation
 _MOST = 400  # terms, for the time that a regression takes
 
 
-@dataclass(frozen=True)
-class WeightedFit:
-    """Result of S weighted least-squares fits of K columns y to P columns X.
+class Fit(NamedTuple):
+    """Result of the fits of K columns y to P columns X in B blocks of rows.
 
     Attributes:
-        theta: coefficients, ``(S, P, K)``.
-        weights: weights of the blocks, ``(S, B)``.
-        squares: sums of squares of the residual of each block, ``(S, B, K)``.
-        totals: sums of squares of y in each block, ``(B, K)``.
+        theta: coefficients of the fit to all blocks, and without each block, ``(1 + B, P, K)``.
+        shares: part of the mean square of y that X leaves in each of these fits, ``(1 + B, K)``.
+        held_out: sums of squares of each block that the fit without it leaves, ``(B, K)``.
     """
 
     theta: np.ndarray
-    weights: np.ndarray
-    squares: np.ndarray
-    totals: np.ndarray
-
-    def shares(self) -> np.ndarray:
-        """Return the part of the mean square of y that X leaves, ``(S, K)``."""
-        left = (self.weights[:, :, None] * self.squares).sum(axis=1)
-        return (left / (self.weights @ self.totals).clip(min=1e-300)).clip(1e-12, 1)
+    shares: np.ndarray
+    held_out: np.ndarray
 
 
 class EquationOfMotionRegression:
     """Least squares between columns of an equation of motion::
 
-        y = X theta + r,     theta = argmin of sum over blocks b of w_b |y_b - X_b theta|^2
+        y = X theta + r,     theta = argmin |y - X theta|^2
 
-    Every question to a log is a choice of y, X and w. With inverse dynamics, y is a force u(t - d)
+    Every question to a log is a choice of y and X. With inverse dynamics, y is a force u(t - d)
     and X holds terms of q, v and a (:func:`terms`, or the regressor of rigid bodies) and of dry
     friction; the delay, a drift of the clock or a saturation is the candidate y with the smallest
     residual, and a coefficient is the dry friction of a joint. With more inputs than coordinates,
@@ -55,39 +47,25 @@ class EquationOfMotionRegression:
     Args:
         columns: columns by name, ``(R,)`` or ``(R, C)``.
         block: block of each row, ``(R,)``.
-        rows: weights of the rows, ``(R, 1)``, or None.
     """
 
-    def __init__(
-        self,
-        columns: Mapping[str, np.ndarray],
-        block: np.ndarray,
-        rows: np.ndarray | None = None,
-    ):
+    def __init__(self, columns: Mapping[str, np.ndarray], block: np.ndarray):
         parts = {name: x.reshape(len(block), -1) for name, x in columns.items()}
         ends = np.cumsum([x.shape[1] for x in parts.values()])
         self.index = {
             name: np.arange(end - x.shape[1], end)
             for (name, x), end in zip(parts.items(), ends, strict=True)
         }
-        self.numbers, self.block = np.unique(block, return_inverse=True)
         values = np.hstack(list(parts.values()))
-        if rows is not None:
-            values = values * rows
         self.scale = np.sqrt((values**2).mean(axis=0)).clip(min=1e-300)
         values = values / self.scale
-        self.products = np.stack(
-            [x.T @ x for x in (values[self.block == b] for b in range(len(self.numbers)))]
-        )
+        blocks = [values[block == b] for b in np.unique(block)]
+        self.products = np.stack([x.T @ x for x in blocks])
 
-    def jackknife(self) -> np.ndarray:
-        """Return weights of the blocks: all, then all without each block, ``(1 + B, B)``."""
-        count = len(self.numbers)
-        return np.vstack([np.ones(count), 1 - np.eye(count)])
-
-    def fit(self, y: str, x: Sequence[str], weights: np.ndarray | None = None) -> WeightedFit:
-        """Fit the columns ``y`` to the columns ``x``, with weights ``(S, B)``; None are ones."""
-        weights = np.ones((1, len(self.numbers))) if weights is None else weights
+    def fit(self, y: str, x: Sequence[str]) -> Fit:
+        """Fit the columns ``y`` to the columns ``x``: to all blocks, and without each in turn."""
+        blocks = np.arange(len(self.products))
+        weights = np.vstack([np.ones(len(blocks)), 1 - np.eye(len(blocks))])
         terms, target = np.concatenate([self.index[name] for name in x]), self.index[y]
         gram = self.products[:, terms[:, None], terms]
         cross, totals = self.products[:, terms[:, None], target], self.products[:, target, target]
@@ -97,19 +75,13 @@ class EquationOfMotionRegression:
         theta = np.linalg.solve(normal, np.tensordot(weights, cross, 1))
         squares = totals - 2 * np.einsum("spk,bpk->sbk", theta, cross)
         squares = squares + np.einsum("spk,sbpk->sbk", theta, gram[None] @ theta[:, None])
-        scale = self.scale[target]
-        return WeightedFit(
-            theta * scale / self.scale[terms][:, None],
-            weights,
-            squares.clip(min=0) * scale**2,
-            totals * scale**2,
+        squares = squares.clip(min=0)
+        left = (weights[:, :, None] * squares).sum(axis=1) / (weights @ totals).clip(min=1e-300)
+        return Fit(
+            theta=theta * self.scale[target] / self.scale[terms][:, None],
+            shares=left.clip(1e-12, 1),
+            held_out=squares[1 + blocks, blocks] * self.scale[target] ** 2,
         )
-
-    def held_out(self, y: str, x: Sequence[str]) -> np.ndarray:
-        """Return the squares of each block that a fit to the other blocks leaves, ``(B, K)``."""
-        squares = self.fit(y, x, self.jackknife()[1:]).squares
-        blocks = np.arange(len(self.numbers))
-        return np.asarray(squares[blocks, blocks])
 
 
 def solve(x: np.ndarray, y: np.ndarray) -> np.ndarray:

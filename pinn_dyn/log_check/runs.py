@@ -31,6 +31,7 @@ HELD = "time in which the joints are held [s]"
 _WINDOW = 0.5  # s
 _WIDTHS, _MOST = 10, 200  # widths in a window, and windows of a log
 _FEWEST = 8  # rows of a window
+_ROWS = 1500  # of an equation of all joints
 _PER_TERM = 6  # rows at least
 _ITERATIONS = 7  # of reweighted least squares
 _RATIO = 4.0  # residual of an odd window over the usual one
@@ -199,18 +200,11 @@ class Equation:
         return self.fitted(self.weights)
 
     def usual(self) -> np.ndarray:
-        """Return the residual of the median window that agrees with the equation, ``(K,)``.
-
-        The joint moves in these windows most of the time, if there are such windows.
-        """
+        """Return the residual of the median window that agrees with the equation, ``(K,)``."""
         agree = self.weights > _AGREES * self.base
-        values = np.where(agree[:, None], self.residual(self.theta), np.nan)
-        counts = np.bincount(self.window)
-        moving = [np.bincount(self.window, ~x) > counts / 2 for x in self.resting.T]
-        in_motion = np.where(np.transpose(moving), values, np.nan)
-        chosen = np.where(np.isfinite(in_motion).any(axis=0), in_motion, values)
+        values = self.residual(self.theta)[agree]
         least = _FRICTION * self.friction_level(self.theta) / self.size
-        return np.maximum(np.nanmedian(chosen, axis=0), least.clip(min=_FLOOR))
+        return np.maximum(np.median(values, axis=0), least.clip(min=_FLOOR))
 
     def predicted(self) -> np.ndarray:
         """Return X theta, ``(R, K)``."""
@@ -252,6 +246,8 @@ def equation_of_motion(
         return _of_states(data, q, window)
     shared = bodies is not None and size == n
     if bodies is not None and shared:
+        stride = max(1, len(data) // _ROWS)
+        data, window = data.rows(slice(None, None, stride)), window[::stride]
         x = chain_columns(data, bodies)
         first = x.shape[2] - OWN * n + OWN * joint
         friction, damping = first + np.array([4, 5, 6]), first + 3

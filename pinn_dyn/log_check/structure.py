@@ -142,7 +142,7 @@ def _shares(data: Averages, bodies: np.ndarray, i: int) -> tuple[float, float, b
     for x in (bodies[rows], None):
         columns = force_columns(data, i, x)
         regression = EquationOfMotionRegression({**columns, "y": y}, tenths(data))
-        left.append(regression.held_out("y", list(columns))[:, 0])
+        left.append(regression.fit("y", list(columns)).held_out[:, 0])
     of_bodies, generic = left
     worse = of_bodies.sum() > _WORSE * generic.sum() and (of_bodies > generic).sum() >= _TENTHS
     return float(of_bodies.sum() / (y**2).sum()), unexplained(y, *columns.values()), bool(worse)
@@ -400,7 +400,7 @@ def _scales(
             "y": data.u[rows, i],
         }
         regression = EquationOfMotionRegression(columns, tenths(data.rows(rows)))
-        fit = regression.fit("y", ["bodies", "drive", "sign"], regression.jackknife())
+        fit = regression.fit("y", ["bodies", "drive", "sign"])
         scale, parts = float(fit.theta[0, 0, 0]), fit.theta[1:, 0, 0]
         error = float(np.sqrt((len(parts) - 1) * parts.var()))
         clear = error < _CERTAIN * abs(scale)
