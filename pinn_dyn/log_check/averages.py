@@ -166,11 +166,6 @@ class Averages:
         """Return about ``count`` rows at equal distances, or all."""
         return self.rows(np.arange(len(self)) % max(1, len(self) // count) == 0)
 
-    def independent_rows(self) -> int:
-        """Return the number of rows whose averages are independent, a width apart."""
-        inside = np.diff(self.stretch) == 0
-        return int(np.diff(self.t)[inside].clip(max=self.width).sum() / self.width)
-
     def independent(self, widths: float = _INDEPENDENT) -> Averages:
         """Return rows at a distance of some widths, at which their averages are independent."""
         stride = round(widths * self.width / (self.t[1] - self.t[0]))

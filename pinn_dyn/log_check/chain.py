@@ -180,24 +180,10 @@ class Readings:
         return np.stack(columns, axis=1) - self.x
 
     def direction(self, h: int) -> float:
-        """Return the sign of M(q) where it is clear, -1 if the inputs give no power; 0 if mixed."""
+        """Return the sign of M(q) for a reading, see :func:`_direction`."""
         y, inertia = self.y[:, :, h], self.inertial @ self.theta[:, h]
-        noise = 2 * (self.residual[:, :, h] * self.data.moving).std(axis=0)
-        smallest = np.maximum(noise, _NOTICEABLE * y.std(axis=0))
-        clear = (inertia * self.data.a).std(axis=0) > smallest
-        positive = (inertia > 0).mean(axis=0)[clear]
-        power = y * self.data.v
-        if (positive > _NEGATIVE).all():
-            return 1.0
-        low = power.sum() < _POWER * np.abs(power).sum()
-        return -1.0 if low and (positive < _NEGATIVE).all() else 0.0
-
-    def unexplained(self, h: int) -> np.ndarray:
-        """Return the unexplained share of each left side for a reading, ``(N,)``."""
-        squares = [
-            ((x[:, :, h] * self.data.moving) ** 2).sum(axis=0) for x in (self.residual, self.y)
-        ]
-        return np.asarray(squares[0] / squares[1].clip(min=1e-300))
+        left = self.residual[:, :, h] * self.data.moving
+        return _direction(inertia, self.data.a, y, left, y * self.data.v)
 
     def dissipated(self, h: int) -> np.ndarray:
         """Return the power of the friction of each joint over that of its force, ``(N,)``."""
@@ -241,13 +227,11 @@ class Order(NamedTuple):
         measurements: measurements.
         joints: joint that each input drives.
         signs: factor 1 or -1 of each input.
-        unexplained: unexplained share of each input in the equation of the chain, ``(M,)``.
     """
 
     measurements: list[Measurement]
     joints: Sequence[int]
     signs: np.ndarray
-    unexplained: np.ndarray
 
     def corrected(self, data: Averages) -> Averages:
         """Return averages with the inputs of the joints in turn, and their signs."""
@@ -257,32 +241,45 @@ class Order(NamedTuple):
         return replace(data, u=data.u[:, order] * factors, inputs=inputs)
 
 
+def _direction(
+    inertia: np.ndarray, a: np.ndarray, y: np.ndarray, left: np.ndarray, power: np.ndarray
+) -> float:
+    """Return the sign of the inertia where it is clear, -1 if the inputs give no power; 0 if mixed.
+
+    Args:
+        inertia: inertias that an equation y = inertia a + ... of each joint has, ``(R, N)``.
+        a: accelerations, ``(R, N)``.
+        y, left: inputs, and their residuals, ``(R, N)``.
+        power: powers of the inputs, ``(R, N)``.
+    """
+    smallest = np.maximum(2 * left.std(axis=0), _NOTICEABLE * y.std(axis=0))
+    clear = (inertia * a).std(axis=0) > smallest
+    positive = (inertia > 0).mean(axis=0)[clear]
+    if (positive > _NEGATIVE).all():
+        return 1.0
+    low = power.sum() < _POWER * np.abs(power).sum()
+    return -1.0 if low and (positive < _NEGATIVE).all() else 0.0
+
+
 def single_signs(data: Averages, u: Columns) -> Order:
     """Look for reversed inputs by the equation of each joint, whose inertia is positive."""
     data, results = data.thinned(_ROWS), []
     for k, name in enumerate(u.columns):
         x = np.hstack([*force_columns(data, k, None).values()])
-        y = data.u[:, k] - np.median(data.u[:, k])
-        mask = data.row_weights()[:, 0] * data.moving[:, k]
-        theta = solve(x * mask[:, None], y * mask)
+        mask = data.row_weights() * data.moving[:, [k]]
+        y, power = (data.u - np.median(data.u, axis=0))[:, [k]] * mask, (data.u * data.v)[:, [k]]
+        theta = solve(x * mask, y)
         pushed = replace(data, a=data.a + np.eye(data.q.shape[1])[k])
         inertia = (np.hstack([*force_columns(pushed, k, None).values()]) - x) @ theta
-        smallest = max(2 * np.std((y - x @ theta) * mask), _NOTICEABLE * np.std(y))
-        power = mask * data.u[:, k] * data.v[:, k]
-        positive = float(np.average(inertia > 0, weights=mask.clip(min=1e-300)))
-        reversed_input = (
-            np.std(inertia * data.a[:, k]) > smallest
-            and positive < _NEGATIVE
-            and power.sum() < _POWER * np.abs(power).sum()
-        )
+        left = y - x * mask @ theta
+        sign = _direction(inertia, data.a[:, [k]], y, left, power * mask)
         text = (
             f"input {name!r} seems to push joint {k + 1} backwards: its effective inertia is "
-            f"negative, and its mean power {power.sum() / mask.sum():.3g} W: is it reversed?"
+            f"negative, and its mean power {power.mean():.3g} W: is it reversed?"
         )
-        sign = -1.0 if reversed_input else 1.0
         results.append(judged(SIGN, name, sign, "1", sign < 0, text))
-    signs = np.array([measurement.value for measurement in results])
-    return Order(results, list(range(len(signs))), signs, np.ones(len(signs)))
+    signs = np.array([-1.0 if x.verdict != "ok" else 1.0 for x in results])
+    return Order(results, list(range(len(signs))), signs)
 
 
 def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) -> Order | None:
@@ -345,4 +342,4 @@ def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) ->
     )
     expected, bad = "above 0", left < _EXPLAINS and bool((lost < -_FORWARDS).all())
     results.append(judged(FRICTION, "all joints", lost.max(), expected, bad, text))
-    return Order(results, joints.tolist(), signs, readings.unexplained(h)[joints])
+    return Order(results, joints.tolist(), signs)

@@ -294,8 +294,7 @@ def _asked(log: _Log, widths: Sequence[Averages]) -> _Answers:
     if not log.servo:
         delays = log.clear_delays(curves)
         order = check_order([x.delayed(delays) for x in chosen], source.u, source.q.units)
-    of_chain = None if order is None else order.unexplained
-    faults, curves, held = input_faults(log.of_training(chosen), curves, source.u, rigid, of_chain)
+    faults, curves, held = input_faults(log.of_training(chosen), curves, source.u, rigid)
     if order is not None and log.square and order.joints != sorted(order.joints):
         curves = [x.without("the inputs are exchanged") for x in curves]
     clear = log.clear_delays(curves)

@@ -119,7 +119,7 @@ def terms(data: Averages, form: str) -> np.ndarray:
             (trig[:, :, None] * x[:, None, :]).reshape(len(x), -1) for x in [*inertial, trig[:, 1:]]
         ]
         count = sum(x.shape[1] for x in products)
-        rich = _RICH * count < data.independent_rows() and count < _MOST
+        rich = _RICH * count < len(data.independent(1.0)) and count < _MOST
         parts += products if rich else inertial
     return np.hstack(parts)
 
@@ -146,11 +146,6 @@ def force_columns(data: Averages, i: int, rigid: np.ndarray | None) -> dict[str,
         "sign": data.sign[:, [i]],
         "slow": data.slow_sign[:, [i, size + i]],
     }
-
-
-def bodies(data: Averages, rigid: Regressor | None) -> np.ndarray | None:
-    """Return the regressor of rigid bodies at the rows, ``(R, N, P)``, or None without a robot."""
-    return None if rigid is None else rigid(data.q, data.v, data.a)
 
 
 def tenths(data: Averages) -> np.ndarray:

@@ -12,7 +12,7 @@ from pinn_dyn.data.logs.check.checks import held_rows
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.log_check.averages import Averages
 from pinn_dyn.log_check.delay import FEWEST, DelayCurve, minimum
-from pinn_dyn.log_check.equation import Regressor, bodies, force_columns, solve
+from pinn_dyn.log_check.equation import Regressor, force_columns, solve
 
 HELD = "rows between two values of the input"
 """Name of the measurement of inputs that are slower than the log."""
@@ -56,17 +56,12 @@ def input_faults(
     curves: Sequence[DelayCurve],
     u: Columns,
     rigid: Regressor | None = None,
-    unexplained: np.ndarray | None = None,
 ) -> tuple[list[Measurement], list[DelayCurve], list[int]]:
-    """Look for faults of inputs that kernels of two widths agree on, see :func:`_faults`.
-
-    ``unexplained`` are the unexplained shares of the inputs in an equation of all joints, if any:
-    an input that it explains has no fault.
-    """
-    results, changed, held = _faults(widths[0], curves, u, rigid, unexplained)
+    """Look for faults of inputs that kernels of two widths agree on, see :func:`_faults`."""
+    results, changed, held = _faults(widths[0], curves, u, rigid)
     if all(x.verdict == "ok" for x in results):
         return results, changed, held
-    again, _, _ = _faults(widths[1], curves, u, rigid, unexplained)
+    again, _, _ = _faults(widths[1], curves, u, rigid)
     if [x.verdict for x in results] == [x.verdict for x in again]:
         return results, changed, held
     return [replace(x, verdict="ok", text="") for x in results], list(curves), [1] * len(curves)
@@ -77,7 +72,6 @@ def _faults(
     curves: Sequence[DelayCurve],
     u: Columns,
     rigid: Regressor | None,
-    unexplained: np.ndarray | None,
 ) -> tuple[list[Measurement], list[DelayCurve], list[int]]:
     """Look for inputs whose clock drifts, whose drive saturates, or that are held for rows.
 
@@ -97,7 +91,7 @@ def _faults(
     last = np.array([ends[k] for k in data.run])
     inside = (data.passed < _LONGEST) & (data.passed * (1 + _LARGEST_DRIFT) <= last)
     used = data.rows(inside).thinned(_ROWS)
-    regressor = bodies(used, rigid)
+    regressor = None if rigid is None else rigid(used.q, used.v, used.a)
     for i, (name, unit) in enumerate(zip(u.columns, u.units, strict=True)):
         moving = used.moving_rows(i)
         drift, level, share = 0.0, np.inf, 0.0
@@ -106,8 +100,6 @@ def _faults(
             trial = _trial(used.rows(moving), i, curves[i], regressor, moving)
             shifts = trial.data.t[:, None] - [trial.delay, *_CONSTANT]
             constant = trial.shares(trial.data.input_at(i, shifts)).min()
-            if unexplained is not None:
-                constant = min(constant, unexplained[i])
             if rows > 1 and _follows_lines(trial, i):
                 held[i] = rows
             elif constant > _SMALL:

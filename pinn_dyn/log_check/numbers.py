@@ -92,9 +92,7 @@ def _turns(data: Averages, k: int) -> bool:
     if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
         return True
     a, inputs = data.a[:, [k]], data.u
-    plain = min(unexplained(a, data.v), unexplained(a, data.v, data.q))
-    periodic = unexplained(a, data.v, np.sin(data.q), np.cos(data.q))
-    if periodic < _PERIODIC * plain or unexplained(a, data.v, inputs, np.sign(data.v)) < _FREE:
+    if unexplained(a, data.v, inputs, np.sign(data.v)) < _FREE:
         return True
     degrees = np.where(np.arange(data.q.shape[1]) == k, math.pi / 180, 1.0)
     converted = replace(data, q=data.q * degrees)

@@ -154,29 +154,18 @@ class Equation:
         return np.stack(parts, axis=1)
 
     @cached_property
-    def base(self) -> np.ndarray:
-        """Weights of the windows ``(B,)``, small where a larger unit would outweigh all others."""
-        values = np.hstack([self.y, self.data.u - np.median(self.data.u, axis=0)])
-        means = self.means(values)
-        usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0)).clip(min=1e-300)
-        return (means / usual).clip(min=1).max(axis=1) ** -2.0
-
-    @cached_property
     def weights(self) -> np.ndarray:
         """Weights of the windows ``(B,)``, small where they disagree with most others.
 
         The fits start from all windows. If many disagree, they start from the earlier and the later
-        half of each run, too: a payload that is picked up in the middle changes half of them.
+        half, too: a payload that is picked up in the middle changes half of them.
         """
-        rows = np.bincount(self.data.run).clip(min=1)
-        late_rows = (
-            self.data.passed > (np.bincount(self.data.run, self.data.passed) / rows)[self.data.run]
-        )
-        late = np.bincount(self.window, late_rows) > np.bincount(self.window) / 2
+        passed = np.bincount(self.window, self.data.passed) / np.bincount(self.window)
+        late = passed > np.median(passed)
         first = self._robust(np.ones(len(late), dtype=bool))
         worst = self.residual(self.fitted(first)).max(axis=1)
         least = float(np.quantile(worst, _AGREE))
-        if (worst > _RATIO * least).mean() < 1 - 2 * _AGREE or late.all() or not late.any():
+        if (worst > _RATIO * least).mean() < 1 - 2 * _AGREE or not late.any():
             return first
         others = [self._robust(start) for start in (~late, late)]
         left = [self.residual(self.fitted(x)).max(axis=1) for x in others]
@@ -188,11 +177,11 @@ class Equation:
         """Return weights by the loss of Geman and McClure (1985), from a mask of windows."""
         weights = start.astype(float)
         for cut in 0.5 ** np.arange(1, _ITERATIONS + 1):
-            residual = self.residual(self.fitted(weights * self.base))
+            residual = self.residual(self.fitted(weights))
             usual = np.median(residual[start], axis=0).clip(min=1e-3)
             worst = (residual / usual).max(axis=1)
             weights = 1 / (1 + (worst / max(2.5, cut * worst.max())) ** 2) ** 2
-        return weights * self.base
+        return weights
 
     @cached_property
     def theta(self) -> np.ndarray:
@@ -201,7 +190,7 @@ class Equation:
 
     def usual(self) -> np.ndarray:
         """Return the residual of the median window that agrees with the equation, ``(K,)``."""
-        agree = self.weights > _AGREES * self.base
+        agree = self.weights > _AGREES
         values = self.residual(self.theta)[agree]
         least = _FRICTION * self.friction_level(self.theta) / self.size
         return np.maximum(np.median(values, axis=0), least.clip(min=_FLOOR))
