@@ -33,7 +33,7 @@ _WIDTHS, _MOST = 10, 200  # widths in a window, and windows of a log
 _FEWEST = 8  # rows of a window
 _ROWS = 1500  # of an equation of all joints
 _PER_TERM = 6  # rows at least
-_ITERATIONS = 7  # of reweighted least squares
+_ITERATIONS = 4  # of reweighted least squares
 _RATIO = 4.0  # residual of an odd window over the usual one
 _FLOOR = 0.005  # usual residual of a window as a share of its signal, at least
 _FRICTION = 0.05  # the same as a share of the dry friction, whose terms are not exact
@@ -154,6 +154,14 @@ class Equation:
         return np.stack(parts, axis=1)
 
     @cached_property
+    def base(self) -> np.ndarray:
+        """Weights of the windows ``(B,)``, small where a larger unit would outweigh all others."""
+        values = np.hstack([self.y, self.data.u - np.median(self.data.u, axis=0)])
+        means = self.means(values)
+        usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0)).clip(min=1e-300)
+        return (means / usual).clip(min=1).max(axis=1) ** -2.0
+
+    @cached_property
     def weights(self) -> np.ndarray:
         """Weights of the windows ``(B,)``, small where they disagree with most others.
 
@@ -176,12 +184,12 @@ class Equation:
     def _robust(self, start: np.ndarray) -> np.ndarray:
         """Return weights by the loss of Geman and McClure (1985), from a mask of windows."""
         weights = start.astype(float)
-        for cut in 0.5 ** np.arange(1, _ITERATIONS + 1):
-            residual = self.residual(self.fitted(weights))
+        for cut in 0.25 ** np.arange(1, _ITERATIONS + 1):
+            residual = self.residual(self.fitted(weights * self.base))
             usual = np.median(residual[start], axis=0).clip(min=1e-3)
             worst = (residual / usual).max(axis=1)
             weights = 1 / (1 + (worst / max(2.5, cut * worst.max())) ** 2) ** 2
-        return weights
+        return weights * self.base
 
     @cached_property
     def theta(self) -> np.ndarray:
@@ -190,7 +198,7 @@ class Equation:
 
     def usual(self) -> np.ndarray:
         """Return the residual of the median window that agrees with the equation, ``(K,)``."""
-        agree = self.weights > _AGREES
+        agree = self.weights > _AGREES * self.base
         values = self.residual(self.theta)[agree]
         least = _FRICTION * self.friction_level(self.theta) / self.size
         return np.maximum(np.median(values, axis=0), least.clip(min=_FLOOR))
