@@ -273,11 +273,16 @@ def single_signs(data: Averages, u: Columns) -> Order:
         inertia = (np.hstack([*force_columns(pushed, k, None).values()]) - x) @ theta
         left = y - x * mask @ theta
         sign = _direction(inertia, data.a[:, [k]], y, left, power * mask)
-        text = (
-            f"input {name!r} seems to push joint {k + 1} backwards: its effective inertia is "
-            f"negative, and its mean power {power.mean():.3g} W: is it reversed?"
+        measurement = judged(
+            name=SIGN,
+            place=name,
+            value=sign,
+            expected="1",
+            bad=sign < 0,
+            text=f"input {name!r} seems to push joint {k + 1} backwards: its effective inertia is "
+            f"negative, and its mean power {power.mean():.3g} W: is it reversed?",
         )
-        results.append(judged(SIGN, name, sign, "1", sign < 0, text))
+        results.append(measurement)
     signs = np.array([-1.0 if x.verdict != "ok" else 1.0 for x in results])
     return Order(results, list(range(len(signs))), signs)
 
@@ -320,26 +325,47 @@ def check_order(widths: Sequence[Averages], u: Columns, units: Sequence[str]) ->
         left = float(readings.left[:, likely[best]].mean())
     if square and (left > _EXPLAINS or (readings.joints[likely] != joints).any()):
         joints, signs = chosen
-    results = []
-    for name, joint, sign in zip(u.columns, joints, signs, strict=True):
-        text = (
-            f"input {name!r} seems to push joint {joint + 1} backwards: with the other sign M(q) "
-            "is positive, and the equations of all joints agree: is it reversed?"
-        )
-        results.append(judged(SIGN, name, sign, "1", sign < 0, text))
-    exchanged = [name for k, name in enumerate(u.columns) if square and joints[k] != k]
-    text = (
-        f"the inputs {' and '.join(map(repr, exchanged))} are exchanged: then the equations of all "
-        "joints agree; correct the order of the columns"
-    )
-    ratio = readings.left[:, 0].mean() / max(left, 1e-300)
-    results.append(judged(EXCHANGED, "inputs", ratio, f"below {_WORSE:g}", bool(exchanged), text))
     h, way = (likely[best], directions[best]) if len(likely) else (0, 1.0)
-    lost = np.max([way * x.dissipated(h) for x in (readings, again)], axis=0)
-    text = (
-        "the friction of all joints pushes forwards: does the time of the log run backwards, or is "
-        "more than the friction compensated in the inputs?"
-    )
-    expected, bad = "above 0", left < _EXPLAINS and bool((lost < -_FORWARDS).all())
-    results.append(judged(FRICTION, "all joints", lost.max(), expected, bad, text))
+    power = np.max([way * x.dissipated(h) for x in (readings, again)], axis=0)
+    results = [_sign(*x) for x in zip(u.columns, joints.tolist(), signs.tolist(), strict=True)]
+    if square:
+        results.append(_exchange(u, joints, readings.left[:, 0].mean() / max(left, 1e-300)))
+    results.append(_friction(power.max(), left < _EXPLAINS and bool((power < -_FORWARDS).all())))
     return Order(results, joints.tolist(), signs)
+
+
+def _sign(name: str, joint: int, sign: float) -> Measurement:
+    return judged(
+        name=SIGN,
+        place=name,
+        value=sign,
+        expected="1",
+        bad=sign < 0,
+        text=f"input {name!r} seems to push joint {joint + 1} backwards: with the other sign M(q) "
+        "is positive, and the equations of all joints agree: is it reversed?",
+    )
+
+
+def _exchange(u: Columns, joints: np.ndarray, ratio: float) -> Measurement:
+    names = [repr(name) for k, name in enumerate(u.columns) if joints[k] != k]
+    return judged(
+        name=EXCHANGED,
+        place="inputs",
+        value=ratio,
+        expected=f"below {_WORSE:g}",
+        bad=len(names) > 0,
+        text=f"the inputs {' and '.join(names)} are exchanged: then the equations of all joints "
+        "agree; correct the order of the columns",
+    )
+
+
+def _friction(power: float, bad: bool) -> Measurement:
+    return judged(
+        name=FRICTION,
+        place="all joints",
+        value=power,
+        expected="above 0",
+        bad=bad,
+        text="the friction of all joints pushes forwards: does the time of the log run backwards, "
+        "or is more than the friction compensated in the inputs?",
+    )

@@ -371,11 +371,16 @@ def _free(log: _Log) -> list[bool]:
 
 
 def _held(rows: int, step: float) -> Measurement:
-    text = (
-        f"q is held at {1 / (rows * step):.3g} Hz: all columns repeat for {rows} rows; add the "
-        "steps below to the data set, and check it again: the equation of motion is not yet checked"
+    return _judged(
+        name="rows between two values of q",
+        place="q",
+        value=rows,
+        expected="1",
+        bad=True,
+        text=f"q is held at {1 / (rows * step):.3g} Hz: all columns repeat for {rows} rows; add "
+        "the steps below to the data set, and check it again: the equation of motion is not yet "
+        "checked",
     )
-    return _judged("rows between two values of q", "q", rows, "1", True, text)
 
 
 def _lines(source: logs.LogSource, held: Sequence[int], rows: int, step: float) -> list[str]:
@@ -435,26 +440,32 @@ def _inputs_measured(
     """Measure the share of the motion that the inputs explain, and their delays."""
     if not delays:
         return []
-    acting = [curve.delay or 0.0 for curve in delays]
     data = replace(data, u=data.u[:, : len(delays)])
-    share = numbers.explained_share(
-        data.delayed([a - c for a, c in zip(acting, clear, strict=True)])
+    lags = [(curve.delay or 0.0) - lag for curve, lag in zip(delays, clear, strict=True)]
+    share = numbers.explained_share(data.delayed(lags))
+    of_motion = _judged(
+        name="share of the motion that inputs add to (1, q, v)",
+        place="inputs",
+        value=share,
+        expected=f"at least {_EXPLAINED}",
+        bad=share < _EXPLAINED,
+        text=f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
+        "inputs of this robot, on the same clock?",
+        verdict="stop",
     )
-    text = (
-        f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
-        "inputs of this robot, on the same clock?"
-    )
-    name, bad = "share of the motion that inputs add to (1, q, v)", share < _EXPLAINED
-    expected = f"at least {_EXPLAINED}"
-    results = [_judged(name, "inputs", share, expected, bad, text, "stop")]
-    for name, curve, lag in zip(source.u.columns, delays, clear, strict=True):
-        delay = np.nan if curve.delay is None else 1e3 * curve.delay
-        text = (
-            f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the delay below to "
-            "the data set"
+    of_delays = [
+        _judged(
+            name="delay [ms]",
+            place=name,
+            value=np.nan if curve.delay is None else 1e3 * curve.delay,
+            expected="no clear delay",
+            bad=lag > 0,
+            text=f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the delay below "
+            "to the data set",
         )
-        results.append(_judged("delay [ms]", name, delay, "no clear delay", lag > 0, text))
-    return results
+        for name, curve, lag in zip(source.u.columns, delays, clear, strict=True)
+    ]
+    return [of_motion, *of_delays]
 
 
 def _excitation(
@@ -472,29 +483,33 @@ def _excitation(
 
 
 def _condition(excitation: RigidExcitation) -> Measurement:
-    condition, open_joints = excitation.condition, ", ".join(excitation.open_joints)
-    text = (
-        f"the rigid-body regressor has the condition number {condition:.3g}: these motions do "
-        f"not determine constants of {open_joints}; use more frequencies, poses and speeds"
+    return _judged(
+        name=f"condition number of {excitation.count} base parameters",
+        place="training",
+        value=excitation.condition,
+        expected=f"below {MOST:g}",
+        bad=excitation.condition > MOST,
+        text=f"the rigid-body regressor has the condition number {excitation.condition:.3g}: these "
+        f"motions do not determine constants of {', '.join(excitation.open_joints)}; use more "
+        "frequencies, poses and speeds",
     )
-    name = f"condition number of {excitation.count} base parameters"
-    return _judged(name, "training", condition, f"below {MOST:g}", condition > MOST, text)
 
 
 def _inputs_table(
     source: logs.LogSource, training: list[logs.Recording], delays: Sequence[DelayCurve]
 ) -> pd.DataFrame:
     u = np.vstack([item.u[:, : len(delays)] for item in training])
-    table = {
-        "input": source.input_labels[: len(delays)],
-        "min": u.min(axis=0),
-        "max": u.max(axis=0),
-        "delay [ms]": [np.nan if x.delay is None else 1e3 * x.delay for x in delays],
-        "± [ms]": [np.nan if x.delay is None else 1e3 * INTERVAL * x.spread for x in delays],
-        "dry friction": [x.friction for x in delays],
-        "method": [x.reason or x.form for x in delays],
-    }
-    return pd.DataFrame(table)
+    return pd.DataFrame(
+        {
+            "input": source.input_labels[: len(delays)],
+            "min": u.min(axis=0),
+            "max": u.max(axis=0),
+            "delay [ms]": [np.nan if x.delay is None else 1e3 * x.delay for x in delays],
+            "± [ms]": [np.nan if x.delay is None else 1e3 * INTERVAL * x.spread for x in delays],
+            "dry friction": [x.friction for x in delays],
+            "method": [x.reason or x.form for x in delays],
+        }
+    )
 
 
 def _run(part: logs.Cleaned) -> dict[str, object]:
@@ -522,25 +537,32 @@ def _coordinates(
     low, high = q.min(axis=0), q.max(axis=0)
     outside = (tested < low) | (tested > high)
     all_poses = (np.array(source.q.units) == "rad") & (high - low > 2 * np.pi)
-    table = {
-        "coordinate": source.labels,
-        "min": low,
-        "max": high,
-        "fastest [/s]": np.abs(v).max(axis=0),
-        "noise of q": noise,
-        "noise / range": noise / (high - low).clip(min=1e-300),
-        "test outside": np.where(all_poses, 0.0, outside.mean(axis=0)),
-    }
-    return pd.DataFrame(table)
+    return pd.DataFrame(
+        {
+            "coordinate": source.labels,
+            "min": low,
+            "max": high,
+            "fastest [/s]": np.abs(v).max(axis=0),
+            "noise of q": noise,
+            "noise / range": noise / (high - low).clip(min=1e-300),
+            "test outside": np.where(all_poses, 0.0, outside.mean(axis=0)),
+        }
+    )
 
 
 def _limited(coordinates: pd.DataFrame) -> list[Measurement]:
-    results = []
-    for name, limit, text in _LIMITS:
-        for label, value in zip(coordinates["coordinate"], coordinates[name], strict=True):
-            message = f"{label}: {text.format(100 * value)}"
-            results.append(_judged(name, label, value, f"below {limit}", value > limit, message))
-    return results
+    return [
+        _judged(
+            name=name,
+            place=label,
+            value=value,
+            expected=f"below {limit}",
+            bad=value > limit,
+            text=f"{label}: {text.format(100 * value)}",
+        )
+        for name, limit, text in _LIMITS
+        for label, value in zip(coordinates["coordinate"], coordinates[name], strict=True)
+    ]
 
 
 def _filter(

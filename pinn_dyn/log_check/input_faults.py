@@ -105,26 +105,11 @@ def _faults(
             elif constant > _SMALL:
                 level, share = _saturation(trial, i)
                 drift = 0.0 if share else _drift(trial, i, min(_LESS * constant, _CLEAR))
-        longest = max(x.t[-1] - x.t[0] for x in data.recordings)
-        text = (
-            f"the clock of input {name!r} drifts by {100 * abs(drift):.2g} % against that of q: at "
-            f"{longest:.3g} s it is {abs(drift) * 1e3 * longest:.3g} ms too "
-            f"{'late' if drift > 0 else 'early'}, which no constant delay repairs; log it with the "
-            "clock of q, or correct its times"
-        )
-        results.append(judged(DRIFT, name, 100 * abs(drift), "0", drift != 0, text))
-        text = (
-            f"input {name!r} {SATURATES}: about {level:.2g} {unit} "
-            f"act where more is logged ({100 * share:.0f} % of the samples); log the measured "
-            "force, or limit the column to what the drive can do"
-        )
-        results.append(judged(SATURATED, name, share, "0", share > 0, text))
-        rate = 1 / (rows * (data.recordings[0].t[1] - data.recordings[0].t[0]))
-        text = (
-            f"input {name!r} is held at {rate:.3g} Hz: its values repeat for {rows} rows, but the "
-            "motion follows lines between them: add the step below to the data set"
-        )
-        results.append(judged(HELD, name, rows, "1", held[i] > 1, text))
+        results += [
+            _drifts(name, drift, max(x.t[-1] - x.t[0] for x in data.recordings)),
+            _saturates(name, share, f"{level:.2g} {unit}"),
+            _is_held(name, rows, data.step, held[i] > 1),
+        ]
         if share:
             changed[i] = curves[i].without("the drive saturates")
         if held[i] > 1:
@@ -133,6 +118,45 @@ def _faults(
             reason = "the clock of the inputs drifts"
             changed = [x.without(x.reason or reason) for x in changed]
     return results, changed, held
+
+
+def _drifts(name: str, drift: float, longest: float) -> Measurement:
+    return judged(
+        name=DRIFT,
+        place=name,
+        value=100 * abs(drift),
+        expected="0",
+        bad=drift != 0,
+        text=f"the clock of input {name!r} drifts by {100 * abs(drift):.2g} % against that of q: "
+        f"at {longest:.3g} s it is {abs(drift) * 1e3 * longest:.3g} ms too "
+        f"{'late' if drift > 0 else 'early'}, which no constant delay repairs; log it with the "
+        "clock of q, or correct its times",
+    )
+
+
+def _saturates(name: str, share: float, level: str) -> Measurement:
+    return judged(
+        name=SATURATED,
+        place=name,
+        value=share,
+        expected="0",
+        bad=share > 0,
+        text=f"input {name!r} {SATURATES}: about {level} act where more is logged "
+        f"({100 * share:.0f} % of the samples); log the measured force, or limit the column to "
+        "what the drive can do",
+    )
+
+
+def _is_held(name: str, rows: int, step: float, bad: bool) -> Measurement:
+    return judged(
+        name=HELD,
+        place=name,
+        value=rows,
+        expected="1",
+        bad=bad,
+        text=f"input {name!r} is held at {1 / (rows * step):.3g} Hz: its values repeat for {rows} "
+        "rows, but the motion follows lines between them: add the step below to the data set",
+    )
 
 
 def _trial(

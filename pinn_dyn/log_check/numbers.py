@@ -73,12 +73,16 @@ def check_angles(data: Averages, q: Columns, free: Sequence[bool]) -> list[Measu
     for k in (k for k, unit in enumerate(q.units) if unit == "rad"):
         recordings = data.recordings
         angle, run = max((float(np.abs(item.q[:, k]).max()), item.run) for item in recordings)
-        text = (
-            f"{run}, column {q.columns[k]!r}: an angle of {angle:.4g} rad is more than two turns: "
-            f"is it in degrees? Its unit is configured as {q.unit[k]!r}"
+        measurement = judged(
+            name="largest angle [rad]",
+            place=q.columns[k],
+            value=angle,
+            expected="below 4 pi",
+            bad=angle > 4 * math.pi and not free[k] and not _turns(data, k),
+            text=f"{run}, column {q.columns[k]!r}: an angle of {angle:.4g} rad is more than two "
+            f"turns: is it in degrees? Its unit is configured as {q.unit[k]!r}",
         )
-        bad = angle > 4 * math.pi and not free[k] and not _turns(data, k)
-        results.append(judged("largest angle [rad]", q.columns[k], angle, "below 4 pi", bad, text))
+        results.append(measurement)
     return results
 
 
@@ -119,11 +123,15 @@ def check_velocity_lag(data: Averages, q: Columns, v: Columns) -> list[Measureme
         # Lag l of a column means that it is read l samples earlier: a late v needs a negative one.
         lag = -lags[best] * step
         clear = shares[best] < min(_LAGGED * shares[lags == 0][0], 1 - _CLEAR**2)
-        bad = bool(clear and abs(lag) > 1.5 * step)
-        text = (
-            f"column {b!r} is {1e3 * abs(lag):.3g} ms {'behind' if lag > 0 else 'ahead of'} the "
-            f"derivative of {a!r}: is it filtered or from another clock? Leave out v (it is then "
-            "computed from q), or correct its times"
+        measurement = judged(
+            name="lag of v [ms]",
+            place=f"{a}, {b}",
+            value=1e3 * lag,
+            expected="0",
+            bad=bool(clear and abs(lag) > 1.5 * step),
+            text=f"column {b!r} is {1e3 * abs(lag):.3g} ms {'behind' if lag > 0 else 'ahead of'} "
+            f"the derivative of {a!r}: is it filtered or from another clock? Leave out v (it is "
+            "then computed from q), or correct its times",
         )
-        results.append(judged("lag of v [ms]", f"{a}, {b}", 1e3 * lag, "0", bad, text))
+        results.append(measurement)
     return results

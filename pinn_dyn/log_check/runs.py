@@ -339,17 +339,22 @@ def check_runs(
         times = narrow.data.t[bad[rows, j]]
         if not cause and not (exact and narrow.shared and _certain(narrow, bad, odd)):
             continue
-        text = (
-            f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
+        measurement = judged(
+            name=RESIDUAL,
+            place=names[k],
+            value=ratios.max(),
+            expected=f"below {_RATIO:g}",
+            bad=True,
+            text=f"run {names[k]} does not fit the rest of the log from {times[0]:.4g} to "
             f"{times[-1]:.4g} s: the residual of {narrow.labels[j]!r} is "
             f"{ratios[:, j].max():.3g} times that of the median window; {cause or _UNKNOWN} "
-            "Correct or leave out this part"
+            "Correct or leave out this part",
         )
-        expected = f"below {_RATIO:g}"
-        results.append(judged(RESIDUAL, names[k], ratios.max(), expected, True, text))
+        results.append(measurement)
         parts.append(Interval(int(k), float(times[0]), float(times[-1])))
-    largest, expected = float((residual / usual).max()), f"below {_RATIO:g}"
-    return results or [judged(RESIDUAL, "all runs", largest, expected, False, "")], parts
+    largest = float((residual / usual).max())
+    good = judged(RESIDUAL, "all runs", largest, f"below {_RATIO:g}", False, "")
+    return results or [good], parts
 
 
 def _certain(motion: Equation, bad: np.ndarray, odd: np.ndarray) -> bool:
@@ -379,13 +384,17 @@ def check_rests(
     if not parts:
         return [judged(HELD, "all runs", 0.0, "0", False, "")], []
     first, more = parts[0], f" and {len(parts) - 1} more parts" if len(parts) > 1 else ""
-    text = (
-        f"run {names[first.run]} from {first.start:.4g} to {first.end:.4g} s{more}: the joints are "
-        "held although the inputs would move them: by a brake, an end stop or a contact? Leave out "
-        "these parts"
+    measurement = judged(
+        name=HELD,
+        place=names[first.run],
+        value=sum(x.end - x.start for x in parts),
+        expected="0",
+        bad=True,
+        text=f"run {names[first.run]} from {first.start:.4g} to {first.end:.4g} s{more}: the "
+        "joints are held although the inputs would move them: by a brake, an end stop or a "
+        "contact? Leave out these parts",
     )
-    seconds = sum(x.end - x.start for x in parts)
-    return [judged(HELD, names[first.run], seconds, "0", True, text)], parts
+    return [measurement], parts
 
 
 def _held_parts(motion: Equation | None) -> list[Interval]:

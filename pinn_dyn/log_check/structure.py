@@ -171,19 +171,18 @@ def compare_structure(
     results = []
     for i, left in fit.left.items():
         joint, generic = structure.joint_names[i], fit.generic[i]
-        text = (
-            f"the URDF leaves {100 * left:.2g} % of {u.columns[i]!r} at joint {joint} "
-            f"unexplained, a generic equation {100 * generic:.2g} %: {hint or _UNKNOWN}"
+        measurement = judged(
+            name=FIT,
+            place=joint,
+            value=left / max(generic, 1e-300),
+            expected=f"below {_WORSE:g}",
+            bad=i in bad,
+            text=f"the URDF leaves {100 * left:.2g} % of {u.columns[i]!r} at joint {joint} "
+            f"unexplained, a generic equation {100 * generic:.2g} %: {hint or _UNKNOWN}",
+            section=SECTION,
         )
-        ratio = left / max(generic, 1e-300)
-        results.append(_judged(FIT, joint, ratio, f"below {_WORSE:g}", i in bad, text))
+        results.append(measurement)
     return results + _scales(structure, fit.data, u, bad), bad
-
-
-def _judged(
-    name: str, place: str, value: float, expected: str, bad: bool, text: str
-) -> Measurement:
-    return judged(name, place, value, expected, bad, text, section=SECTION)
 
 
 def _left(cause: _Cause, joints: Sequence[int]) -> float:
@@ -388,7 +387,7 @@ def _scales(
     if not (forces or set(u.units) <= {"A"}) or structure.tree.problems:
         return []
     forces_of_bodies = _forces(structure, data)
-    results = []
+    expected, results = f"{1 / _SCALE:g} to {_SCALE:g}" if forces else "above 0", []
     for i, joint in enumerate(structure.joint_names):
         rows = data.moving[:, i]
         if i in bad or rows.sum() < FEWEST:
@@ -406,11 +405,16 @@ def _scales(
         clear = error < _CERTAIN * abs(scale)
         wrong = not 1 / _SCALE < scale < _SCALE if forces else scale < 0
         cause = "reversed" if scale < 0 else "in another unit, or at the motor instead of the joint"
-        text = (
-            f"input {u.columns[i]!r} is {scale:.3g} times the torque of the URDF's bodies at joint "
-            f"{joint}: is it {cause}? Correct the column or its unit, or the masses of the URDF"
+        measurement = judged(
+            name=SCALE,
+            place=joint,
+            value=scale if clear else np.nan,
+            expected=expected,
+            bad=clear and wrong,
+            text=f"input {u.columns[i]!r} is {scale:.3g} times the torque of the URDF's bodies at "
+            f"joint {joint}: is it {cause}? Correct the column or its unit, or the masses of the "
+            "URDF",
+            section=SECTION,
         )
-        expected = f"{1 / _SCALE:g} to {_SCALE:g}" if forces else "above 0"
-        value = scale if clear else np.nan
-        results.append(_judged(SCALE, joint, value, expected, clear and wrong, text))
+        results.append(measurement)
     return results

@@ -56,15 +56,19 @@ def check_repeats(
         (piece.run, item.run) for piece in pieces for item in earlier if _is_in(piece, item)
     )
     title = f"motions of the {name} that repeat one of another split"
-    results = []
-    for (run, original), count in pairs.items():
-        text = (
-            f"{name}: {count} of the motions of {run} repeat one of {original}, of another "
-            "split: keep such runs in one split"
+    results = [
+        judged(
+            name=title,
+            place=run,
+            value=count,
+            expected="0",
+            bad=True,
+            text=f"{name}: {count} of the motions of {run} repeat one of {original}, of another "
+            "split: keep such runs in one split",
+            section="docs/csv_logs.md#splits",
         )
-        results.append(
-            judged(title, run, count, "0", True, text, section="docs/csv_logs.md#splits")
-        )
+        for (run, original), count in pairs.items()
+    ]
     return results or [judged(title, name, 0, "0", False, "")]
 
 
@@ -170,10 +174,15 @@ def check_clock(
                 f"{t[k + 1]:.9g} s ({int(rows.sum())} such rows, {typical:.6g} s is usual): "
                 f"{cure}"
             )
-    bad = in_bursts and "bursts" not in repairs
-    expected = f"below {_BURSTS}"
-    text = f"{table.name}: {_BURST_TEXT}, first of the steps: {' '.join(burst_steps(t))}"
-    return [judged("share of rows in bursts", table.name, bursts, expected, bad, text)]
+    measurement = judged(
+        name="share of rows in bursts",
+        place=table.name,
+        value=bursts,
+        expected=f"below {_BURSTS}",
+        bad=in_bursts and "bursts" not in repairs,
+        text=f"{table.name}: {_BURST_TEXT}, first of the steps: {' '.join(burst_steps(t))}",
+    )
+    return [measurement]
 
 
 def check_rows(

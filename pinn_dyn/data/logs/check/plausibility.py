@@ -12,7 +12,7 @@ import scipy
 from pinn_dyn import wording
 from pinn_dyn.data.logs.check.checks import held_rows
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
+from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 
 STATE = "distance of the input from a measured state"
@@ -40,13 +40,17 @@ def check_inputs(training: list[Recording], q: Columns, u: Columns) -> list[Meas
     ]
     for i, name in enumerate(u.columns):
         distance, state = _nearest_state(training, q, i)
-        text = (
-            f"input {name!r} is {state}, not a command: any model predicts q from it, and no "
-            "controller can use it; log the command that is sent"
+        measurement = judged(
+            name=STATE,
+            place=name,
+            value=distance,
+            expected=f"above {_COPY:g} steps",
+            bad=distance < _COPY,
+            text=f"input {name!r} is {state}, not a command: any model predicts q from it, and no "
+            "controller can use it; log the command that is sent",
+            verdict="stop",
         )
-        bad = distance < _COPY
-        measured = (STATE, name, distance)
-        results.append(judged(*measured, f"above {_COPY:g} steps", bad, text, "stop"))
+        results.append(measurement)
     return results
 
 
@@ -82,12 +86,8 @@ def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measur
 
     At rest no coordinate moves faster than a hundredth of its fastest motion in the training.
     """
-    results, training = [], splits["train"]
-    for k, name in enumerate(q.columns):
-        spread = np.concatenate([item.q[:, k] for item in training]).std()
-        text = f"column {name!r} (q): moves no more than its noise, {spread:.3g} {q.units[k]}"
-        measured = ("spread of q in the training", name, spread, "above noise")
-        results.append(judged(*measured, not moves(training, k), text))
+    training = splits["train"]
+    results = [_spread(training, k, name, q.units[k]) for k, name in enumerate(q.columns)]
     rows = max(held_rows(item.q) for item in training)  # held values do not move row by row
     steps = {
         name: np.vstack([np.abs(item.q[rows:] - item.q[:-rows]) for item in items])
@@ -105,11 +105,29 @@ def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measur
                 "errors there tell little of a model; take another part or run for "
                 f"{wording.setting(f'dataset.{part}')}"
             )
-        stop = name == "train" and share > _ALL_AT_REST
-        verdict: Verdict = "stop" if stop else "warning"
-        expected, bad = f"below {_AT_REST}", share > _AT_REST
-        results.append(judged("share at rest", part, share, expected, bad, text, verdict))
+        measurement = judged(
+            name="share at rest",
+            place=part,
+            value=share,
+            expected=f"below {_AT_REST}",
+            bad=share > _AT_REST,
+            text=text,
+            verdict="stop" if name == "train" and share > _ALL_AT_REST else "warning",
+        )
+        results.append(measurement)
     return results
+
+
+def _spread(training: Sequence[Recording], k: int, name: str, unit: str) -> Measurement:
+    spread = np.concatenate([item.q[:, k] for item in training]).std()
+    return judged(
+        name="spread of q in the training",
+        place=name,
+        value=spread,
+        expected="above noise",
+        bad=not moves(training, k),
+        text=f"column {name!r} (q): moves no more than its noise, {spread:.3g} {unit}",
+    )
 
 
 def check_velocities(
@@ -154,12 +172,17 @@ def check_velocities(
             where += f" and {more} more runs, " if more else ", "
             ratio = products[odd, k, k].sum() / max(dv[odd, k].sum(), 1e-300)
             cause = "is v reversed, stuck or in another unit there?"
-        text = (
-            f"{where}columns {a!r} and {b!r}: the derivative of q is {ratio:.4g} times v, expected "
-            f"1, with a correlation of {correlation:.2f}{' elsewhere' if where else ''}: {cause}"
+        measurement = judged(
+            name="dq/dt over v",
+            place=f"{a}, {b}",
+            value=ratio,
+            expected=f"{low} to {high}",
+            bad=len(cause) > 0,
+            text=f"{where}columns {a!r} and {b!r}: the derivative of q is {ratio:.4g} times v, "
+            f"expected 1, with a correlation of {correlation:.2f}{' elsewhere' if where else ''}: "
+            f"{cause}",
         )
-        expected = f"{low} to {high}"
-        results.append(judged("dq/dt over v", f"{a}, {b}", ratio, expected, bool(cause), text))
+        results.append(measurement)
     return results
 
 
@@ -187,13 +210,17 @@ def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measure
     lost, early = int(late.sum()), int((times < 2 - _LOST).sum())
     bad = lost >= 5 and lost > _OFTEN * early and whole.mean() > 0.8
     share = lost / max(len(times), 1)
-    text = (
-        f"in {100 * share:.2g} % of the steps q moves as far as v does in two or more sample "
+    measurement = judged(
+        name=LOST,
+        place=", ".join(q.columns),
+        value=share,
+        expected="0",
+        bad=bool(bad),
+        text=f"in {100 * share:.2g} % of the steps q moves as far as v does in two or more sample "
         "times: rows are lost, and the clock counts the rows that are left; log the times of the "
-        "samples"
+        "samples",
     )
-    place = ", ".join(q.columns)
-    return [judged(LOST, place, share, "0", bool(bad), text)]
+    return [measurement]
 
 
 def moves(recordings: Sequence[Recording], k: int) -> bool:
