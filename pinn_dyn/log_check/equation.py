@@ -64,24 +64,28 @@ class EquationOfMotionRegression:
 
     def fit(self, y: str, x: Sequence[str]) -> Fit:
         """Fit the columns ``y`` to the columns ``x``: to all blocks, and without each in turn."""
-        blocks = np.arange(len(self.products))
-        weights = np.vstack([np.ones(len(blocks)), 1 - np.eye(len(blocks))])
+        count = len(self.products)
+        weights = np.vstack([np.ones(count), 1 - np.eye(count)])
         terms, target = np.concatenate([self.index[name] for name in x]), self.index[y]
         gram = self.products[:, terms[:, None], terms]
         cross, totals = self.products[:, terms[:, None], target], self.products[:, target, target]
-        normal = np.tensordot(weights, gram, 1)
+        normal, right = np.tensordot(weights, gram, 1), np.tensordot(weights, cross, 1)
         size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / len(terms)
-        normal = normal + (_RIDGE * size + 1e-300) * np.eye(len(terms))
-        theta = np.linalg.solve(normal, np.tensordot(weights, cross, 1))
-        squares = totals - 2 * np.einsum("spk,bpk->sbk", theta, cross)
-        squares = squares + np.einsum("spk,sbpk->sbk", theta, gram[None] @ theta[:, None])
-        squares = squares.clip(min=0)
-        left = (weights[:, :, None] * squares).sum(axis=1) / (weights @ totals).clip(min=1e-300)
+        theta = np.linalg.solve(normal + (_RIDGE * size + 1e-300) * np.eye(len(terms)), right)
+        total = weights @ totals
         return Fit(
             theta=theta * self.scale[target] / self.scale[terms][:, None],
-            shares=left.clip(1e-12, 1),
-            held_out=squares[1 + blocks, blocks] * self.scale[target] ** 2,
+            shares=(_squares(theta, normal, right, total) / total.clip(min=1e-300)).clip(1e-12, 1),
+            held_out=_squares(theta[1:], gram, cross, totals) * self.scale[target] ** 2,
         )
+
+
+def _squares(
+    theta: np.ndarray, gram: np.ndarray, cross: np.ndarray, totals: np.ndarray
+) -> np.ndarray:
+    """Return the sum of squares of y - X theta from XᵀX, Xᵀy and yᵀy, ``(S, K)``."""
+    squares = totals - 2 * (theta * cross).sum(axis=1) + (theta * (gram @ theta)).sum(axis=1)
+    return np.asarray(squares.clip(min=0))
 
 
 def solve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
