@@ -180,11 +180,11 @@ def _agreed(curves: Sequence[DelayCurve], step: float) -> DelayCurve:
     least = min(x.residual.min() for x in curves)
     good = [x for x in curves if x.residual.min() <= _WORSE * least]
     best = min(good, key=lambda x: (x.delay is None, not x.of_bodies, x.spread))
-    if best.delay is not None and not best.of_bodies:
-        for other in (x for x in good if x.delay is not None):
-            width = step + INTERVAL * np.hypot(best.spread, other.spread)
-            if abs(best.delay - other.delay) > width:
-                return best.without(f"{best.form} and {other.form} disagree")
+    for other in good if not best.of_bodies else ():
+        if best.delay is None or other.delay is None:
+            continue
+        if abs(best.delay - other.delay) > step + INTERVAL * np.hypot(best.spread, other.spread):
+            return best.without(f"{best.form} and {other.form} disagree")
     place = minimum(best.candidates, best.residual)
     others = [x for x in curves if abs(minimum(x.candidates, x.residual) - place) > step]
     return replace(best, other=others[0] if others else None)

@@ -83,7 +83,8 @@ def _faults(
         Measurements, the curves without the delays of these inputs, and for each input the rows
         between the updates that lines have to join, or 1.
     """
-    results, changed, held = [], list(curves), [1] * len(curves)
+    results: list[Measurement] = []
+    changed, held = list(curves), [1] * len(curves)
     if len(curves) > data.q.shape[1]:
         return results, changed, held
     ends = {k: data.passed[data.run == k].max() for k in np.unique(data.run)}

@@ -15,7 +15,6 @@ from pinn_dyn.log_check.equation import terms, unexplained
 
 _LAGS = 30  # of a target that are tried
 _STILL = 0.01  # variance of a coordinate at rest as a share of the largest
-_PERIODIC = 0.6  # of the acceleration: largest share that periodic terms leave
 _FREE = 0.03  # largest share of the acceleration of a free motor that its input leaves
 _BETTER = 0.5  # residual with one unit of an angle over that with the other
 _EXACT = 1e-6  # residual that is one of rounding

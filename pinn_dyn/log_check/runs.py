@@ -243,8 +243,8 @@ def equation_of_motion(
         return _of_states(data, q, window)
     shared = bodies is not None and size == n
     if bodies is not None and shared:
-        stride = max(1, len(data) // _ROWS)
-        data, window = data.rows(slice(None, None, stride)), window[::stride]
+        thin = np.arange(len(data)) % max(1, len(data) // _ROWS) == 0
+        data, window = data.rows(thin), window[thin]
         x = chain_columns(data, bodies)
         first = x.shape[2] - OWN * n + OWN * joint
         friction, damping = first + np.array([4, 5, 6]), first + 3

@@ -113,7 +113,7 @@ def fit_structure(structure: Structure, widths: Sequence[Averages]) -> Structure
     rigid = regressor(structure)
     thinned = [data.thinned(_ROWS) for data in widths]
     bodies = [rigid(data.q, data.v, data.a) for data in thinned]
-    joints = np.flatnonzero(thinned[0].moving.sum(axis=0) >= FEWEST)
+    joints = np.flatnonzero(thinned[0].moving.sum(axis=0) >= FEWEST).tolist()
     pairs = zip(thinned, bodies, strict=True)
     shares = [[_shares(data, x, i) for i in joints] for data, x in pairs]
     left, generic, worse = np.reshape(shares, (2, len(joints), 3)).transpose(2, 0, 1)
@@ -121,10 +121,10 @@ def fit_structure(structure: Structure, widths: Sequence[Averages]) -> Structure
     bad = suspect & (worse > 0).all(axis=0)
     return StructureFit(
         data=thinned[0],
-        left=dict(zip(joints.tolist(), left[0], strict=True)),
-        generic=dict(zip(joints.tolist(), generic[0], strict=True)),
-        suspects=set(joints[suspect].tolist()),
-        bad=set(joints[bad].tolist()),
+        left=dict(zip(joints, left[0].tolist(), strict=True)),
+        generic=dict(zip(joints, generic[0].tolist(), strict=True)),
+        suspects={i for i, x in zip(joints, suspect, strict=True) if x},
+        bad={i for i, x in zip(joints, bad, strict=True) if x},
     )
 
 
@@ -207,7 +207,8 @@ def _explanation(structure: RigidChain, data: Averages, joints: Sequence[int]) -
     """
     data = data.thinned(_FEW)
     plain = _changed("", data, regressor(structure))
-    total, texts = _left(plain, joints), {}
+    total = _left(plain, joints)
+    texts: dict[str, float] = {}
     for causes in (_causes, _offsets, _gears):
         texts |= {x.text: _left(x, joints) for x in causes(structure, plain, joints)}
         least = min(texts.values())
@@ -375,8 +376,8 @@ def _ordered(data: Averages, order: np.ndarray) -> Averages:
 
 def _forces(structure: RigidChain, data: Averages) -> np.ndarray:
     """Return the forces of the bodies of the URDF, ``(R, N)``."""
-    motion = map(torch.from_numpy, (data.q, data.v, data.a))
-    return np.asarray(structure.rigid_force(*motion).numpy())
+    q, v, a = map(torch.from_numpy, (data.q, data.v, data.a))
+    return np.asarray(structure.rigid_force(q, v, a).numpy())
 
 
 def _scales(
