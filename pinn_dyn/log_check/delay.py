@@ -125,7 +125,7 @@ def input_delays(
         forms = [[_motion_curve(data, form, candidates) for data in trials] for form in _OF_STATES]
         curves = [_agreed([_best(x) for x in forms], step)] * inputs
     else:
-        regressors = [[None] * len(trials)]
+        regressors: list[list[np.ndarray | None]] = [[None] * len(trials)]
         if rigid is not None and inputs == size:
             regressors.append([rigid(x.q, x.v, x.a) for x in trials])
         curves = []

@@ -117,8 +117,8 @@ def fit_structure(structure: Structure, widths: Sequence[Averages]) -> Structure
     pairs = zip(thinned, bodies, strict=True)
     shares = [[_shares(data, x, i) for i in joints] for data, x in pairs]
     left, generic, worse = np.reshape(shares, (2, len(joints), 3)).transpose(2, 0, 1)
-    suspect = (left > _WORSE * generic).all(axis=0)
-    bad = suspect & (worse > 0).all(axis=0)
+    suspect = np.all(left > _WORSE * generic, axis=0)
+    bad = suspect & np.all(worse > 0, axis=0)
     return StructureFit(
         data=thinned[0],
         left=dict(zip(joints, left[0].tolist(), strict=True)),
