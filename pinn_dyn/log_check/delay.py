@@ -125,16 +125,10 @@ def input_delays(
         forms = [[_motion_curve(data, form, candidates) for data in trials] for form in _OF_STATES]
         curves = [_agreed([_best(x) for x in forms], step)] * inputs
     else:
-        regressors: list[list[np.ndarray | None]] = [[None] * len(trials)]
+        bodies = []
         if rigid is not None and inputs == size:
-            regressors.append([rigid(x.q, x.v, x.a) for x in trials])
-        curves = []
-        for i in range(inputs):
-            forms = [
-                [_input_curve(data, i, y, candidates) for data, y in zip(trials, x, strict=True)]
-                for x in regressors
-            ]
-            curves.append(_agreed([_best(x) for x in forms], step))
+            bodies = [rigid(data.q, data.v, data.a) for data in trials]
+        curves = [_force_curve(trials, i, bodies, candidates) for i in range(inputs)]
     for i in range(inputs):
         signals = [item.u[:, i] for item in recordings]
         if all(_is_sine(x) for x in signals):
@@ -174,20 +168,35 @@ def are_held(curves: Sequence[DelayCurve], step: float) -> bool:
 def _agreed(curves: Sequence[DelayCurve], step: float) -> DelayCurve:
     """Return the curve of the clearest equation, without a delay that an equally good one denies.
 
-    A delay makes up for terms that a worse equation of motion lacks, such as inertia or a force
-    that the bodies of a URDF lack. With a delay, that of the bodies counts first.
+    A delay makes up for terms that a worse equation of motion lacks, such as inertia.
     """
     least = min(x.residual.min() for x in curves)
     good = [x for x in curves if x.residual.min() <= _WORSE * least]
-    best = min(good, key=lambda x: (x.delay is None, not x.of_bodies, x.spread))
-    for other in good if not best.of_bodies else ():
+    best = min(good, key=lambda x: (x.delay is None, x.spread))
+    for other in good:
         if best.delay is None or other.delay is None:
             continue
         if abs(best.delay - other.delay) > step + INTERVAL * np.hypot(best.spread, other.spread):
             return best.without(f"{best.form} and {other.form} disagree")
-    place = minimum(best.candidates, best.residual)
-    others = [x for x in curves if abs(minimum(x.candidates, x.residual) - place) > step]
-    return replace(best, other=others[0] if others else None)
+    return best
+
+
+def _force_curve(
+    widths: Sequence[Averages], i: int, bodies: Sequence[np.ndarray], candidates: np.ndarray
+) -> DelayCurve:
+    """Return the curve of input i: of rigid bodies if they have a delay, else a generic one."""
+    generic = [_input_curve(data, i, None, candidates) for data in widths]
+    best = _best(generic)
+    if not bodies:
+        return best
+    rigid = [_input_curve(data, i, x, candidates) for data, x in zip(widths, bodies, strict=True)]
+    # A delay would make up for a force that the bodies lack.
+    pairs = zip(rigid, generic, strict=True)
+    fitting = [x if x.residual.min() <= _WORSE * y.residual.min() else y for x, y in pairs]
+    curves = sorted([_best(fitting), best], key=lambda x: x.delay is None)
+    places = [minimum(candidates, x.residual) for x in curves]
+    differ = abs(places[0] - places[1]) > candidates[1] - candidates[0]
+    return replace(curves[0], other=curves[1] if differ else None)
 
 
 def _best(curves: Sequence[DelayCurve]) -> DelayCurve:
