@@ -63,7 +63,7 @@ def chain_regressor(units: Sequence[str]) -> Regressor | None:
         factors = [_factors(x, unit) for x, unit in zip(q.T, units, strict=True)]
         columns = []
         for i, j in itertools.combinations_with_replacement(range(len(units)), 2):
-            degrees = [0 if k <= i else 1 if k <= j else 2 for k in range(len(units))]
+            degrees = [int(k > i) + int(k > j) for k in range(len(units))]
             values, slopes = _products(factors, degrees)
             rates = np.einsum("rnk,rn->rk", slopes, v)
             column = -slopes * (v[:, i] * v[:, j])[:, None, None]
