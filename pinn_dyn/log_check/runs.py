@@ -33,7 +33,7 @@ _WIDTHS, _MOST = 10, 200  # widths in a window, and windows of a log
 _FEWEST = 8  # rows of a window
 _ROWS = 1500  # of an equation of all joints
 _PER_TERM = 6  # rows at least
-_ITERATIONS = 4  # of reweighted least squares
+_ITERATIONS = 7  # of reweighted least squares
 _RATIO = 4.0  # residual of an odd window over the usual one
 _FLOOR = 0.005  # usual residual of a window as a share of its signal, at least
 _FRICTION = 0.05  # the same as a share of the dry friction, whose terms are not exact
@@ -184,7 +184,7 @@ class Equation:
     def _robust(self, start: np.ndarray) -> np.ndarray:
         """Return weights by the loss of Geman and McClure (1985), from a mask of windows."""
         weights = start.astype(float)
-        for cut in 0.25 ** np.arange(1, _ITERATIONS + 1):
+        for cut in 0.5 ** np.arange(1, _ITERATIONS + 1):
             residual = self.residual(self.fitted(weights * self.base))
             usual = np.median(residual[start], axis=0).clip(min=1e-3)
             worst = (residual / usual).max(axis=1)
