@@ -9,6 +9,7 @@ from torchdiffeq import odeint
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
 from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
+from pinn_dyn.mechanics.integrators import Wrapped
 from pinn_dyn.mechanics.rollout import path_between, step_grid
 from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkPotential
 from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
@@ -30,7 +31,7 @@ def test_the_loop_gives_what_torchdiffeq_gives(interpolation, batch, substeps):
     u = samples(batch, count, 1)
     x0 = samples(batch, 1, 4, seed=1).squeeze(-2)
     signal, t = Signal(t_input, u, interpolation), t_input[::2]
-    path = path_between(system, RK4(substeps), x0, t, signal)
+    path = path_between(system, Wrapped(RK4(substeps)), x0, t, signal)
 
     def rate(time, x):
         return system.state_derivative(x, signal.at(time[None])[0])
