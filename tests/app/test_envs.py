@@ -87,15 +87,6 @@ def test_a_learned_robot_moves_as_its_model_predicts(run):
     torch.testing.assert_close(states, expected, rtol=0, atol=1e-10)
 
 
-def test_longer_steps_are_integrated_in_those_of_the_training(lnn_run):
-    run = pinn_dyn.load(lnn_run)
-    fine = RobotEnv(run)
-    (action,) = actions_of(fine, 1)
-    coarse = rolled_out(RobotEnv(run, step=3 * fine.dt), [action])
-    expected = rolled_out(fine, [action] * 3)[[0, -1]]
-    np.testing.assert_allclose(coarse, expected, rtol=0, atol=1e-10)
-
-
 def test_the_delay_of_the_data_shifts_the_inputs(lnn_run):
     """A delay of two steps: the robot moves as without the delay and with two zeros before."""
     run = pinn_dyn.load(lnn_run)
@@ -174,24 +165,6 @@ def test_a_robot_that_diverges_gains_nothing():
     assert np.isfinite(observation).all()
     left = 50 - len(rewards) + 1
     assert rewards[-1] == pytest.approx(left * rewards[-2])
-
-
-def test_several_environments_step_together():
-    envs = gymnasium.make_vec(
-        "pinn_dyn.envs:pinn_dyn/Robot-v0",
-        num_envs=2,
-        vectorization_mode="sync",
-        robot=damped_oscillators(),
-        data=Recorded(2, 1),
-    )
-    first, _ = envs.reset(seed=[0, 1])
-    assert (first[0] == oscillators().reset(seed=0)[0]).all()
-    assert envs.step(envs.action_space.sample())[0].shape == (2, 6)
-
-
-def test_a_robot_without_data_is_told_so():
-    with pytest.raises(TypeError, match="set data"):
-        RobotEnv(damped_oscillators())
 
 
 def moved(model, factor):
@@ -275,47 +248,6 @@ def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
         is_over = terminated | truncated
     assert size == run.model.num_coordinates
     assert env.observation_space.contains(observations)
-
-
-def test_robots_may_start_again_in_the_same_step(lnn_run):
-    run = pinn_dyn.load(lnn_run)
-    later, same = (
-        RobotVectorEnv(run, 2, duration=0.03, autoreset=mode)
-        for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
-    )
-    for env in (later, same):
-        env.reset(seed=3)
-        env.action_space.seed(0)
-    for _ in range(later.steps):
-        actions = later.action_space.sample()
-        expected, *_ = later.step(actions)
-        started, _, terminated, truncated, infos = same.step(actions)
-    assert (terminated | truncated).all()
-    np.testing.assert_array_equal(infos["final_obs"], expected)
-    assert (started != expected).any(1).all()
-    moved, rewards, *_ = same.step(actions)
-    assert (moved != started).any(1).all()
-    assert rewards.all()
-
-
-@pytest.mark.filterwarnings("ignore:overflow")
-def test_a_robot_of_a_vector_that_diverges_stays_and_starts_again():
-    model = LinearSystem([[1.0]], [[-1e9]], [[0.0]], [[1.0]])
-    env = RobotVectorEnv(ModelPlant(model, step=0.1), 2, data=Recorded(1, 1), duration=20.0)
-    env.reset(seed=0)
-    count, terminated = 0, np.zeros(2)
-    while not terminated.any():
-        last = env._observations()
-        state, rewards, terminated, _, _ = env.step(np.zeros((2, 1)))
-        count += 1
-    assert terminated.all()
-    np.testing.assert_array_equal(state, last)
-    goal = -np.square(last[:, 0] - last[:, 2])
-    np.testing.assert_allclose(rewards, goal * (env.steps - count + 1))
-    state, rewards, terminated, truncated, _ = env.step(np.zeros((2, 1)))
-    assert not (terminated | truncated).any()
-    assert (np.abs(state[:, :2]) < 2).all()
-    assert not rewards.any()
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)

@@ -144,11 +144,6 @@ def test_a_mistake_about_a_log_ends_with_its_name_and_place(
     assert not list(tmp_path.rglob("*.ckpt"))
 
 
-def test_the_preset_of_the_neck_asks_for_the_log(tmp_path, capsys):
-    words = ["dataset=neck", "data=multi_step", "model=lnn", f"hydra.run.dir={tmp_path / 'run'}"]
-    assert "no value for dataset.files" in refused_text(capsys, "train.py", *words)
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_bag_and_the_same_data_as_csv_give_the_same_weights(tmp_path):
     table = motion(6.0)

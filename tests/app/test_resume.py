@@ -17,7 +17,6 @@ import pinn_dyn
 from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.training import WholeCheckpoints
 from tests.app.entry import (
     NO_FIGURES,
     TINY,
@@ -263,25 +262,3 @@ def test_resume_refuses_changed_data(command, capsys):
 
 
 # Writing.
-
-
-def test_a_checkpoint_is_replaced_only_by_a_whole_one(tmp_path, monkeypatch):
-    path = tmp_path / "last.ckpt"
-    writer = WholeCheckpoints()
-    writer.save_checkpoint({"step": 1}, path)
-    before = path.stat().st_ino
-    with path.open("rb") as open_before:
-        writer.save_checkpoint({"step": 2}, path)
-        # A reader of the old file still reads it whole: the new one is another file.
-        assert torch.load(open_before, weights_only=True) == {"step": 1}
-    assert path.stat().st_ino != before
-
-    def fails_midway(checkpoint, file):
-        file.write(b"half of it")
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(torch, "save", fails_midway)
-    with pytest.raises(OSError, match="No space left"):
-        writer.save_checkpoint({"step": 3}, path)
-    assert torch.load(path, weights_only=True) == {"step": 2}
-    assert list(tmp_path.iterdir()) == [path]

@@ -51,11 +51,6 @@ def test_constants_are_fitted_and_loaded_without_hydra_and_lightning(tmp_path):
     assert list((tmp_path / "run" / "tensorboard").glob("events*"))
 
 
-def test_what_is_blocked_cannot_be_imported(tmp_path):
-    process = run(tmp_path / "run", "network", ["lightning"])
-    assert "ModuleNotFoundError: import of lightning halted" in process.stderr
-
-
 def test_a_run_is_read_without_the_imports_of_its_callbacks():
     code = """
 import sys
