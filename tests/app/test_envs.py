@@ -14,8 +14,7 @@ from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
 from tests.models.builders import VARIANTS, make_structured
 from tests.support.closed_loops import Vanishing
 from tests.support.known import known_model
-from tests.support.simulated_arms import simulated_by
-from tests.support.urdf_by_hand import SPATIAL
+from tests.support.simulated_arms import SPATIAL, simulated_by
 
 gymnasium = pytest.importorskip("gymnasium", reason="the envs extra is not installed")
 from gymnasium.utils.env_checker import check_env  # noqa: E402

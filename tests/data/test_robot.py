@@ -25,8 +25,7 @@ from pinn_dyn.data.robot_excitation import DrawnMotion
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 from tests.support.processes import fork
-from tests.support.simulated_arms import SIMULATORS, simulated_by
-from tests.support.urdf_by_hand import SPATIAL
+from tests.support.simulated_arms import SIMULATORS, SPATIAL, simulated_by
 
 TRACKED = {
     "frequency": [0.05, 0.5],

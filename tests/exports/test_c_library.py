@@ -1,7 +1,5 @@
 """Functions compiled in C for this process, and the same functions without a compiler."""
 
-import os
-
 import pytest
 
 from pinn_dyn.exports import c_library
@@ -56,14 +54,3 @@ def test_files_that_others_own_or_may_write_are_not_loaded(library, monkeypatch,
         path.chmod(path.stat().st_mode | 0o020)
     assert rebuilt(monkeypatch)
     assert ("chmod -R go-w" in caplog.text) == (place != "file")
-
-
-def test_what_killed_compilations_have_left_is_deleted(tmp_path):
-    """A compilation that may still run stays."""
-    folder = tmp_path / "compiled"
-    folder.mkdir(mode=0o700)
-    for name in ("unfinished-old", "unfinished-new"):
-        (folder / name).mkdir()
-    os.utime(folder / "unfinished-old", (0, 0))
-    assert load_code(LIBRARY).number() == 7
-    assert [x.name for x in folder.glob("unfinished-*")] == ["unfinished-new"]
