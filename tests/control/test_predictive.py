@@ -189,8 +189,7 @@ def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
     assert "leaves the limits of q[0]" in caplog.text
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize(("bad", "k"), [(np.nan, 0), (-np.inf, 1)])
 def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
     law = PredictiveControl(pendulum(), 0.6, STEP, observer_bandwidth=5.0)
     pipeline, goal = Pipeline(law, STEP), SetPoint([1.0])(0.0)
@@ -217,12 +216,3 @@ def test_limits_and_references_that_are_not_numbers_are_named():
             PredictiveControl(pendulum(), 0.6, STEP, **{name: np.nan})
     with pytest.raises(ValueError, match="low nan and high None, expected low <= high"):
         Actuator(low=np.nan)
-
-
-def test_values_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match="v_max is"):
-        PredictiveControl(pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
-    with pytest.raises(ValueError, match="expected at least two steps"):
-        PredictiveControl(pendulum(), 0.05, STEP)
-    with pytest.raises(ValueError, match=r"q_low\[0\] is 1, which exceeds q_high\[0\], 0.5"):
-        PredictiveControl(pendulum(), 0.6, STEP, q_low=1.0, q_high=0.5)
