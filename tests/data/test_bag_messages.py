@@ -125,13 +125,6 @@ def test_commands_without_stamps_are_put_on_the_clock_of_the_states(tmp_path, fi
     assert table.notes == ["times of receipt put /commands on the clock of /joint_states"]
 
 
-def test_names_of_joints_may_contain_a_slash(tmp_path):
-    joints = ["arm/j1", "arm/j2"]
-    write(tmp_path / "bag", states(names=joints))
-    columns = [f"{STATES}/{x}/{joint}" for x in ("position", "effort") for joint in joints]
-    assert_motion(read(tmp_path / "bag", columns))
-
-
 def test_a_gripper_on_the_topic_of_the_arm_is_named(tmp_path):
     one = np.array([0.1])
     grip = [(t + 0.002, joint_state(0, names=["finger"], q=one, u=one)) for t in T[::2, 0]]
@@ -201,7 +194,6 @@ def test_messages_that_come_late_are_sorted(tmp_path):
     ("plugin", "mode"),
     [
         (StoragePlugin.MCAP, CompressionMode.FILE),
-        (StoragePlugin.SQLITE3, CompressionMode.FILE),
         (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
     ],
 )
