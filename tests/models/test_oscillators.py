@@ -65,14 +65,6 @@ def test_a_step_solves_the_equation_of_motion_at_the_mean_state():
     assert_near(found, torch.from_numpy(mean[:4] + std[:4] * np.array(path)), 1e-7)
 
 
-def test_weights_of_a_force_without_changes_of_the_inputs_are_refused():
-    model = oscillators()
-    weights = model.state_dict()
-    weights["force.first.weight"] = weights["force.first.weight"][:, :2]
-    with pytest.raises(ValueError, match="without the change of the inputs"):
-        model.load_state_dict(weights)
-
-
 def test_a_step_follows_the_equation_of_motion():
     """A system slower by s with coordinates larger by s, against SciPy's solution of the ODE."""
     errors = []

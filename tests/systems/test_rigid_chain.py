@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia
 from pinn_dyn.testing import MechanicalSystemContract
@@ -16,7 +15,6 @@ from tests.support.rigid_chains import TREE, joint, link, robot
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 STATES = 100
-NEEDS_COMPILER = pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
 
 
 def urdf_file(name):
@@ -127,14 +125,6 @@ def test_parameters_and_pseudo_inertia_are_each_others_inverse():
     assert torch.allclose(inertial_parameters(pseudo_inertia(parameters)), parameters)
 
 
-def dynamics_of(chain, q, v, u):
-    """Acceleration, and the gradient of its square in the inertias of the bodies."""
-    inertia = chain.inertia.clone().requires_grad_()
-    mass, bias = chain.mass_and_bias(q, v, inertia)
-    a = torch.linalg.solve(mass, u - bias)
-    return a.detach(), torch.autograd.grad(a.square().mean(), inertia)[0]
-
-
 def test_a_payload_is_not_scaled_with_the_links():
     settings = {"locked_joints": ["wrist"], "tip": "hand"}
     chain, other = (RigidChain(TREE, **settings, payload=x) for x in (0.0, 0.8))
@@ -173,21 +163,6 @@ def test_a_last_generic_body_does_not_lie_on_the_axis(axis):
             0.5 * torch.ones(1, 1).double(), *torch.zeros(2, 1, 1).double(), body
         )
         assert float(force) > 0
-
-
-@pytest.mark.slow
-@NEEDS_COMPILER
-def test_compiled_it_is_the_same_chain():
-    chain = RigidChain(TREE, locked_joints=["wrist"])
-    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(2)).double()
-    torch._dynamo.reset()
-    # One graph: anything that is done in Python between two would be an error. One C++ file.
-    options = {"cpp_wrapper": True}
-    compiled = torch.compile(chain.mass_and_bias, fullgraph=True, options=options)
-    expected = dynamics_of(chain, q, v, u)
-    chain.mass_and_bias = compiled
-    for found, value in zip(dynamics_of(chain, q, v, u), expected, strict=True):
-        assert torch.allclose(found, value, rtol=1e-9, atol=1e-11 * float(value.abs().max()))
 
 
 def test_coordinates_may_have_another_order():

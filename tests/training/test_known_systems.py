@@ -54,14 +54,13 @@ def true_values(truth):
 
 STARTS = {
     "ten times": {"mass": 5.0, "stiffness": 200.0, "damping": 20.0},
-    "a tenth": {"mass": 0.05, "stiffness": 2.0, "damping": 0.2},
     "mixed": {"mass": 1.5, "stiffness": 4.0, "damping": 10.0},
 }
 
 
 @pytest.mark.parametrize(
     "start",
-    ["ten times", *(pytest.param(x, marks=pytest.mark.slow) for x in ("a tenth", "mixed"))],
+    ["ten times", pytest.param("mixed", marks=pytest.mark.slow)],
 )
 def test_a_soft_arm_is_found_from_starts_that_are_far_off(arm_runs, start):
     truth = known_arm()
