@@ -379,10 +379,6 @@ def test_train_and_fit_have_one_set_of_defaults():
         assert trained.config[key] == fitted.config[key]
 
 
-def test_a_delay_of_the_inputs_is_that_of_the_source():
-    assert fit(delay=0.04).input_delay == pytest.approx([0.04] * 3)
-
-
 @pytest.mark.parametrize("kind", ["dict", "list", "columns", "path"])
 def test_a_log_is_fitted_in_every_form(monkeypatch, tmp_path, kind):
     frame, sources = log().reset_index(drop=True), []
@@ -403,13 +399,6 @@ def test_a_log_is_fitted_in_every_form(monkeypatch, tmp_path, kind):
     assert len(first.train) == len(second.train)
     for a, b in zip(first.train, second.train, strict=True):
         torch.testing.assert_close(a.q, b.q, atol=1e-9, rtol=0)
-
-
-def test_an_array_without_names_is_refused_with_a_call_that_works():
-    with pytest.raises(TypeError, match=r"the log is a ndarray, expected a data frame") as error:
-        pinn_dyn.fit(np.zeros((9, 3)), q="q1", u="u1")
-    call = re.search(r"as in (pandas\..*)", str(error.value))[1]
-    assert list(eval(call, {"pandas": pd, "array": np.zeros((9, 3))})) == ["t", "q1", "u1"]
 
 
 def test_an_interrupted_training_ends_with_one_line(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from pinn_dyn import load
-from pinn_dyn.models import CoulombFriction, ElasticJoints, KnownMechanics, Servo
+from pinn_dyn.models import CoulombFriction, ElasticJoints, Servo
 from tests.app.entry import NO_FIGURES, ROOT, fails, run_script
 from tests.support.delayed_robots import log, resting
 
@@ -84,17 +84,6 @@ def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
     effects, unit = "targets of servos.*", "dataset.u.unit=rad"
     model = printed_training(tmp_path, capsys, pd.DataFrame(table), effects, unit)
     assert isinstance(model.input, Servo)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_the_printed_training_identifies_the_structure_of_the_check(tmp_path, capsys):
-    item = resting(0.3)
-    table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
-    table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
-    settings = structure("double_pendulum")
-    model = printed_training(tmp_path, capsys, pd.DataFrame(table), "its constants", *settings)
-    assert isinstance(model, KnownMechanics)
-    assert len(model.structure.joint_names) == 2
 
 
 def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):

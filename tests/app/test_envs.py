@@ -219,36 +219,6 @@ def test_robots_with_other_constants_move_as_their_own_models(name, delay):
     torch.testing.assert_close(found[0][last], expected[0][0], rtol=0, atol=1e-10)
 
 
-def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
-    """Observations, rewards and ends of robots in a row, also in the episode after the first."""
-    run = pinn_dyn.load(lnn_run)
-    env, single = RobotVectorEnv(run, 3, duration=0.05), RobotEnv(run, duration=0.05)
-    observations, _ = env.reset(seed=0)
-    env.action_space.seed(0)
-    size = observations.shape[1] // 3
-    is_over = np.zeros(3, dtype=bool)
-    single.reset()
-    for _ in range(2 * env.steps + 1):
-        actions, before = 2 * env.action_space.sample(), observations  # beyond the limits
-        observations, rewards, terminated, truncated, _ = env.step(actions)
-        for k in range(3):
-            if is_over[k]:  # the action has no effect, and a new episode starts
-                assert rewards[k] == 0
-                assert (observations[k] != before[k]).reshape(3, -1).any(1).all()  # q, v, goal
-                continue
-            q, v, single._goal = np.split(before[k], 3)
-            single.plant.start(torch.from_numpy(q[None]), torch.from_numpy(v[None]))
-            single._state = np.concatenate([q, v])
-            expected, reward, ended, _, info = single.step(actions[k])
-            np.testing.assert_allclose(observations[k], expected, rtol=0, atol=1e-10)
-            assert rewards[k] == pytest.approx(reward, abs=1e-10)
-            assert terminated[k] == ended
-            assert env.distances()[k] == pytest.approx(info["distance"], abs=1e-8)
-        is_over = terminated | truncated
-    assert size == run.model.num_coordinates
-    assert env.observation_space.contains(observations)
-
-
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_episodes_of_a_vector_end_and_start_as_those_of_gymnasium(mode):
     """Against SyncVectorEnv: a robot restarts by mask, one diverges, also in its last step."""

@@ -6,7 +6,6 @@ import shutil
 import signal
 import time
 from functools import partial
-from pickle import UnpicklingError
 
 import lightning as L
 import pytest
@@ -213,16 +212,6 @@ def test_a_damaged_last_checkpoint_is_replaced_by_the_best_one(command, capsys, 
     (log,) = set(command.rglob("events.out.tfevents.*")) - before
     events = EventAccumulator(str(log)).Reload().Scalars("val/error_mean")
     assert [event.step for event in events] == list(range(step + 4, 30, 5))
-
-
-def test_lightning_reads_no_code_from_a_checkpoint(command, monkeypatch):
-    """Behind the check of the checkpoint, which is replaced here."""
-    change(command, payload=Marker("was_here"))
-    good = checkpoint(command, "best")
-    monkeypatch.setattr("pinn_dyn.run.run_folder.read_checkpoint", lambda path: good)
-    with pytest.raises(UnpicklingError, match="Weights only load failed"):
-        run_script("train.py", f"resume={command}")
-    assert not os.path.exists("was_here")
 
 
 def test_a_resumed_training_writes_to_its_own_folder(command, tmp_path):
