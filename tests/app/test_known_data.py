@@ -178,18 +178,3 @@ def test_inputs_that_are_no_forces_need_gains(unit):
     for gains in ({"drive_gain": 8.0}, {"drive_gain": [1, 8, 1]}, {"gain_spread": 0.5}):
         check_known(known(**gains), source)
     check_known(known(), log_of(["q1", "q2", "q3"], unit="1"))  # as of a data frame
-
-
-class Labelled:
-    """A source other than a log, known by its labels."""
-
-    labels = ("q1 [rad]", "q2 [rad]", "q3 [rad]")
-
-    def __init__(self, *input_labels):
-        self.input_labels = input_labels
-
-
-def test_other_sources_are_known_by_their_labels():
-    check_known(known(), Labelled("tau1 [Nm]", "tau2", "tau3 [N]"))
-    with pytest.raises(ConfigError, match=r"the inputs are i2 in A, no forces"):
-        check_known(known(), Labelled("tau1 [Nm]", "i2 [A]", "tau3"))

@@ -11,7 +11,7 @@ import pytest
 import pinn_dyn
 from pinn_dyn.data.logs import LogError, LogSource
 from pinn_dyn.systems import BulletArm, RigidChain
-from tests.app.entry import NO_FIGURES, ROOT, TINY_DATA, fails, run_script, train
+from tests.app.entry import ROOT
 from tests.support.rigid_chains import joint, link, robot
 
 ARM = robot(link("base"), link("rod"), joint("hinge", "continuous", "base", "rod"))
@@ -84,24 +84,6 @@ def test_the_command_for_a_xacro_file_makes_a_robot_that_loads(tmp_path, monkeyp
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     subprocess.run(command, shell=True, check=True)
     assert RigidChain("robot.urdf").joint_names == ["hinge"]
-
-
-def test_runs_of_different_data_are_evaluated_separately_or_on_one_data_set(
-    tmp_path, lnn_run, undrawn
-):
-    other = train(tmp_path / "other", "model=mlp", "dataset.seed=5", NO_FIGURES)
-    words = [f"runs=[{lnn_run},{other}]", "horizon=0.1", "windows=[]"]
-    message = str(fails("evaluate.py", *words, f"hydra.run.dir={tmp_path / '0'}").code)
-    assert f"{other} has another data set" in message
-    assert "evaluate them separately, or all on one data set, dataset=<name>" in message
-    for k, run in enumerate((lnn_run, other), 1):
-        words[0] = f"runs=[{run}]"
-        run_script("evaluate.py", *words, f"hydra.run.dir={tmp_path / str(k)}")
-    words[0] = f"runs=[{lnn_run},{other}]"
-    run_script(
-        "evaluate.py", *words, "dataset=soft_arm_1", *TINY_DATA, f"hydra.run.dir={tmp_path / '3'}"
-    )
-    assert len(pd.read_csv(tmp_path / "3" / "summary.csv")) >= 2
 
 
 def test_an_ensemble_has_the_interval_that_a_single_network_has_not(lnn_run, run_of):

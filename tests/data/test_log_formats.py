@@ -13,7 +13,7 @@ import yaml
 from hydra.utils import instantiate
 from rosbags.highlevel import AnyReader
 
-from pinn_dyn.data.logs import READERS, LogError, LogSource, Request, Resample
+from pinn_dyn.data.logs import LogError, LogSource, Request, Resample
 from pinn_dyn.data.logs.columns import to_si
 from pinn_dyn.data.logs.readers.bags import read_bag
 from tests.data import log_formats as formats
@@ -122,15 +122,6 @@ def test_lerobot_files_have_vectors_and_episodes_also_without_their_column(tmp_p
     log = source(tmp_path, **{**formats.LEROBOT, "trajectory": None})
     assert len({part.raw.run for part in log.cleaned}) == 3
     assert "the time goes back to 0 s: a run is assumed to start there (2 such rows)" in log.report
-
-
-def test_a_format_is_one_function(tmp_path, monkeypatch):
-    monkeypatch.setitem(READERS, ".pkl", lambda path, request: pd.read_pickle(path))
-    TABLE.to_pickle(tmp_path / "run.pkl")
-    assert_read(source(tmp_path, files="*.pkl"), TABLE)
-    (tmp_path / "run.foo").touch()
-    with pytest.raises(LogError, match=r"no reader for '\.foo': save the log as one of \.csv"):
-        source(tmp_path, files="*.foo").load()
 
 
 PAGE = (Path(__file__).parents[2] / "docs" / "bags_and_other_logs.md").read_text()

@@ -45,17 +45,6 @@ def test_a_clean_log_arrives_as_it_is(folder):
     assert stack(splits.test).t[-1] == pytest.approx(1.0)
 
 
-def test_files_may_be_absolute_paths(tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "root").mkdir()
-    write(tmp_path / "elsewhere", motion())
-    expected = source(tmp_path / "elsewhere").load().train[0]
-    for files in (f"{tmp_path}/elsewhere/run.csv", [f"{tmp_path}/else*/*.csv"]):
-        log = source(tmp_path / "root", files=files)
-        assert torch.equal(log.load().train[0].q, expected.q)
-        assert log.cleaned[0].raw.run == "run"
-
-
 def test_the_delay_of_a_data_set_is_the_last_step(folder):
     """After the cleaning, so that no input is interpolated across a gap."""
     late = InputDelay([0.015, 0.02])

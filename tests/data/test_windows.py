@@ -332,9 +332,3 @@ def test_coverage_counts_the_coordinates():
     )
     for value in windows.q.T.numpy():
         assert kstest(value, "uniform", args=(-1, 2)).statistic < 0.06
-
-
-def test_coverage_of_a_robot_at_rest_draws_what_is_there():
-    still = make_trajectory(0)
-    still = dataclasses.replace(still, q=torch.zeros_like(still.q))
-    assert len(draw([still], coverage=1.0)) == 30

@@ -1,7 +1,6 @@
 """Designed motions against random ones, on an arm that MuJoCo moves."""
 
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import torch
 import yaml
 
 import pinn_dyn
-from pinn_dyn.identification.designed_motion import DesignedMotion
 from pinn_dyn.identification.motion_limits import Envelope, MotionLimits
 from pinn_dyn.identification.rigid_excitation import motion_excitation
 from pinn_dyn.systems import RigidChain
@@ -173,13 +171,3 @@ def test_files_and_figure_are_written(design, tmp_path):
     np.testing.assert_allclose(table["tau_lift"], design.tau[::5, 1], atol=1e-6)
     assert (tmp_path / "motion.png").stat().st_size > 10_000
     assert yaml.safe_load((tmp_path / "joint_trajectory.yaml").read_text())["points"]
-
-
-def test_names_of_joints_are_quoted_in_yaml():
-    names = ["a: b", "[x", "no", "1e3", "\"'", "#", "é\u2028\n- z", "*a", "], points: []"]
-    zero = torch.zeros(2, len(names)).double()
-    envelope = SimpleNamespace(robot=SimpleNamespace(joint_names=names))
-    motion = DesignedMotion(envelope, torch.tensor([0.0, 0.05]), zero, zero, zero, zero, None, 1.0)
-    message = yaml.safe_load(motion.joint_trajectory())
-    assert message["joint_names"] == names
-    assert len(message["points"]) == 2

@@ -173,21 +173,6 @@ def test_windows_are_set_back_to_the_true_state():
     torch.testing.assert_close(prediction.error(), expected)
 
 
-def test_errors_name_what_does_not_fit():
-    truth, model = ramps(), PointMass()
-    with pytest.raises(ValueError, match=r"step is 0\.3 s and the sample time .* 0\.25 s"):
-        predict_trajectories(model, truth, step=0.3)
-    with pytest.raises(ValueError, match=r"step is 0\.1 s and the sample time .* 0\.25 s"):
-        predict_trajectories(model, truth, step=0.1)
-    with pytest.raises(ValueError, match=r"window is 0\.75 s and step is 0\.5 s"):
-        predict_trajectories(model, truth, window=0.75, step=0.5)
-    with pytest.raises(ValueError, match=r"window is 4\.0 s, but .* last only 3 s"):
-        predict_trajectories(model, truth, window=4.0)
-    uneven = Trajectory(truth.q, truth.v, Signal(truth.t**2, truth.u))
-    with pytest.raises(ValueError, match="sample time varies"):
-        predict_trajectories(model, uneven, step=0.25)
-
-
 # Ensembles.
 
 

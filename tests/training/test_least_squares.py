@@ -221,13 +221,6 @@ def test_every_signal_passes_the_same_filter():
         assert float(error.abs().max()) < 0.01, name
 
 
-def test_data_that_do_not_fit_the_filter_are_refused(runs):
-    with pytest.raises(ValueError, match="less than half the sample rate"):
-        filtered_motion(runs, 50.0, samples=10)
-    with pytest.raises(ValueError, match="at least three periods"):
-        filtered_motion(runs, 0.5, samples=10)
-
-
 @pytest.fixture
 def solved(monkeypatch):
     """The stages that were begun: the identification, then short and long rollouts."""
@@ -239,42 +232,6 @@ def solved(monkeypatch):
 
     monkeypatch.setattr(LeastSquares, "_solve", recorded)
     return begun
-
-
-@pytest.mark.parametrize(
-    ("minimization", "evaluation"),
-    [(1, 8), (3, 4)],
-)
-def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
-    truth, runs, unseen, solved, monkeypatch, minimization, evaluation
-):
-    windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
-    solver, model = LeastSquares(cutoff=20.0), robot_model("generic")
-    before = held_out_error(model, truth, unseen)
-    evaluate, calls = least_squares._evaluate, itertools.count(1)
-
-    def interrupted(model, residuals, z, derivative):
-        found = evaluate(model, residuals, z, derivative)
-        if len(solved) == minimization and next(calls) == evaluation:
-            vector_to_parameters(z + 3, model.parameters())  # a step too far
-            raise KeyboardInterrupt
-        return found
-
-    kept = []
-    with monkeypatch.context() as patch:
-        patch.setattr(least_squares, "_evaluate", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            solver.fit(model, runs, windows, keep=kept.append)
-    count = sum(p.numel() for p in model.parameters())
-    assert [fit.stopped_in for fit in kept] == ([0] if minimization == 1 else [1, 2, 2])
-    fit = Fit.from_state(kept[-1].state(), count)
-    assert held_out_error(model, truth, unseen) < 0.9 * before
-    solved.clear()
-    found = solver.fit(model, runs, windows, stopped=fit)
-    assert found.stopped_in is None
-    assert len(solved) == (3 if minimization == 1 else 1)  # what was finished is not done again
-    assert held_out_error(model, truth, unseen) < 0.01
-    assert not found.prior.mean.any()
 
 
 def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, identified):
@@ -330,22 +287,6 @@ def test_a_later_stage_is_kept_unless_it_is_clearly_worse(runs, monkeypatch, cha
     model = robot_model("prior")
     LeastSquares(cutoff=20.0).fit(model, runs, windows, validate=lambda _: next(errors))
     assert float(next(model.parameters()).detach().flatten()[0]) == stage
-
-
-def test_fewer_residuals_than_constants_are_refused(runs, caplog):
-    few, enough = (draw_windows(runs, count=k, steps=2, stride=2, seed=0) for k in (2, 40))
-    count = sum(p.numel() for p in robot_model("generic").parameters())
-    message = f"2 windows of 2 steps give 16 residuals for {count} constants.*data.pairs"
-    with pytest.raises(ValueError, match=message):
-        LeastSquares(cutoff=20.0).fit(robot_model("generic"), runs, few)
-    message = f"8 samples of .* give 16 residuals for {count} constants.* optimizer.samples"
-    with pytest.raises(ValueError, match=message):
-        LeastSquares(cutoff=20.0, samples=8).fit(robot_model("generic"), runs, enough)
-    known = 1e-4 * torch.eye(count).double()
-    LeastSquares(cutoff=20.0, samples=8, rollouts=False).fit(
-        robot_model("generic"), runs, few, known
-    )
-    assert f"give 16 residuals for {count} constants" in caplog.text
 
 
 def test_the_fit_without_a_run_is_exact_for_a_linear_model(runs):
