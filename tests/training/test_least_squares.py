@@ -221,19 +221,6 @@ def test_every_signal_passes_the_same_filter():
         assert float(error.abs().max()) < 0.01, name
 
 
-@pytest.fixture
-def solved(monkeypatch):
-    """The stages that were begun: the identification, then short and long rollouts."""
-    begun, solve = [], LeastSquares._solve
-
-    def recorded(self, stage, *arguments, **settings):
-        begun.append(stage)
-        return solve(self, stage, *arguments, **settings)
-
-    monkeypatch.setattr(LeastSquares, "_solve", recorded)
-    return begun
-
-
 def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, identified):
     """Windows that start at wrong velocities spoil the rollouts, not the identification."""
     windows = draw_windows(runs, count=20, steps=4, stride=1, seed=0)
