@@ -10,7 +10,6 @@ from pinn_dyn.training import LeastSquares
 from tests.support.known import known_arm, known_cart_pole, motions
 
 RATE = 100.0  # Hz
-STIFFNESS = [20, 18, 30, 15, 16, 25]  # of two segments
 
 
 def runs_of(truth, seed=0):
