@@ -78,18 +78,12 @@ def test_the_package_imports_nothing_until_it_is_asked():
         pinn_dyn.Fit  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    ("command", "argument", "absent"),
-    [
-        ("train", "dataset=example_log dataset.test.peice=3", "torch"),
-        ("check", "longest_delay=none", "lightning"),
-    ],
-)
-def test_a_typo_is_answered_without_slow_imports(command, argument, absent):
+def test_a_typo_is_answered_without_slow_imports():
     code = (
-        f"import sys, pinn_dyn.app.command as c; sys.argv[1:] = {argument.split()}\n"
-        f"try: c.main({command!r})\n"
-        f"except SystemExit as e: sys.exit({absent!r} in sys.modules or 'Error' not in str(e))"
+        "import sys, pinn_dyn.app.command as c\n"
+        "sys.argv[1:] = ['dataset=example_log', 'dataset.test.peice=3']\n"
+        "try: c.main('train')\n"
+        "except SystemExit as e: sys.exit('torch' in sys.modules or 'Error' not in str(e))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
