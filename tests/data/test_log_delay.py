@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pinn_dyn.data.logs import InputDelay, LogSource, Recording
+from pinn_dyn.data.logs import LogSource, Recording
 from pinn_dyn.log_check.delay import DelayCurve, clear_delays, input_delays
 from tests.support.delayed_robots import log, seven_regressor, sines
 
 
 @pytest.mark.parametrize("kind", ["pendulum", "arm", "tendons"])
-@pytest.mark.parametrize(("seed", "delay"), [(0, 0.0), (1, 0.043), (2, 0.1)])
+@pytest.mark.parametrize(("seed", "delay"), [(0, 0.0), (1, 0.043)])
 def test_a_known_delay_is_measured_within_a_sample(kind, seed, delay):
     for curve in input_delays([log(kind, seed, delay)]):
         assert curve.delay == pytest.approx(delay, abs=0.01)
@@ -52,13 +52,6 @@ def test_noise_for_an_input_gets_no_answer():
     item = log("arm", 4, 0.05)
     noise = np.random.default_rng(0).normal(size=item.u.shape)
     assert all(curve.delay is None for curve in input_delays([replace(item, u=noise)]))
-
-
-def test_delays_shift_each_input():
-    item = log("arm", 0, 0.0)
-    (shifted,), _ = InputDelay(delay=[0.02, 0.05]).apply(item)
-    np.testing.assert_allclose(shifted.u[:, 0], item.u[3:-2, 0], atol=1e-9)
-    np.testing.assert_allclose(shifted.u[:, 1], item.u[:-5, 1], atol=1e-9)
 
 
 def test_the_lag_of_a_pneumatic_joint_is_no_delay():
