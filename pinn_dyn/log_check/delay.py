@@ -8,10 +8,11 @@ A candidate d is judged by the share that an equation of motion leaves unexplain
 
 Motors move a robot with more inputs than q, or with positions or pressures as inputs. f is a
 polynomial, of third order if the data are enough for it. An inertia acts like a delay, and makes up
-for errors of f like a delay: if T explains more, the delay is between those without and with T. Noise of the
-acceleration makes inertias too small, and a delay would make up for it: kernels that leave too much
-noise are not used. The form and width count whose estimate varies least when parts of the data are
-left out in turn (jackknife).
+for errors of f like a delay: if T explains more, the delay is between those without and with T.
+
+Noise of the acceleration makes inertias too small, and a delay would make up for it: kernels that
+leave too much noise are not used. The form and width count whose estimate varies least when parts
+of the data are left out in turn (jackknife).
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _DEPTH = 0.8  # largest residual as a share of its median
 _SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 ms
 _UNEXPLAINED = 0.4  # largest residual
 _WORSE = 2.0  # residual over that of the best equation of motion, beyond which it is left out
-_HEAVIER = 0.7  # residual with inertia over that without, below which the robot has inertia
+_LITTLE = 0.7  # residual with inertia over that without, from which inertia explains little
 FEWEST = 20 * GROUPS
 """Smallest number of rows of a regression."""
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
@@ -193,17 +194,20 @@ def _better(generic: DelayCurve, rigid: DelayCurve, step: float) -> DelayCurve:
 
 
 def _between(light: DelayCurve, heavy: DelayCurve) -> DelayCurve:
-    """Return the delay without inertia, or the mean of both, with a spread that covers both."""
-    if light.delay is None or heavy.residual.min() > _HEAVIER * light.residual.min():
+    """Return the delay without inertia if that explains little, or a delay that covers both."""
+    if light.delay is None:
+        return light
+    other = max(minimum(heavy.candidates, heavy.residual), 0.0)
+    mean, apart = (light.delay + other) / 2, abs(light.delay - other)
+    if apart > mean:
+        texts = [f"{1e3 * x:.0f} ms by {c.form}" for x, c in ((light.delay, light), (other, heavy))]
+        return light.without(" and ".join(texts))
+    if heavy.residual.min() > _LITTLE * light.residual.min():
         return light
     if heavy.delay is None:
-        return light.without("an inertia explains the motion as well as a delay")
-    mean, apart = (light.delay + heavy.delay) / 2, abs(light.delay - heavy.delay)
-    if apart > mean:
-        texts = [f"{1e3 * x.delay:.0f} ms by {x.form}" for x in (light, heavy)]
-        return light.without(" and ".join(texts))
-    spread = max(light.spread, heavy.spread)
-    return replace(light, delay=mean, spread=float(np.hypot(spread, apart / 2 / INTERVAL)))
+        return light.without(heavy.reason)
+    spread = np.hypot(max(light.spread, heavy.spread), apart / 2 / INTERVAL)
+    return replace(light, delay=mean, spread=float(spread))
 
 
 def _best(curves: Sequence[DelayCurve]) -> DelayCurve:
