@@ -28,14 +28,15 @@ def simulated(load: float) -> pd.DataFrame:
     """Return the logs of a drive with a load in Nm."""
     rng = np.random.default_rng(0)
     step, samples = 1 / RATE, RATE * SECONDS
-    short, t = step / SUBSTEPS, np.arange(samples) / RATE
+    short, t = step / SUBSTEPS, np.arange(samples) * step
     tables = []
     for run in range(RUNS):
         frequency, size = rng.uniform(0.1, 3, 6), rng.uniform(0.1, 0.4, 6)
-        phase, factor = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.5, 1)
-        torque = factor * np.sin(2 * np.pi * np.outer(t, frequency) + phase) @ size
+        phase, factor = rng.uniform(0, 6.28, 6), rng.uniform(0.5, 1)
+        sines = size * np.sin(2 * np.pi * frequency * t[:, None] + phase)
+        torque = sines.sum(axis=1) * factor
         levels = np.repeat(rng.uniform(-0.5, 0.5, samples // 34 + 1), 34)[:samples]
-        torque += levels * (run % 2)
+        torque = torque + levels * (run % 2)
         q, v, angles = 0.0, 0.0, []
         for u in torque:
             angles.append(q)
@@ -76,7 +77,7 @@ def main() -> None:
     cases = [("linear", []), ("linear", [0]), ("hold", [0])]
     for load, settings in ((LOAD, cases), (0.0, cases[:1])):
         frame = simulated(load)
-        print(f"load {load:g} Nm, {frame.q.abs().max() / (2 * np.pi):.2g} revolutions", flush=True)
+        print(f"load {load:g} Nm, {np.ptp(frame.q) / (2 * np.pi):.2g} revolutions", flush=True)
         for interpolation, angles in settings:
             source = log_of(frame, interpolation)
             model = partial(LagrangianNetwork, friction=CoulombFriction, angles=angles)
