@@ -211,7 +211,8 @@ def _answers(
     if odd:
         widths = [data.rows(~np.any([x.of(data) for x in odd], axis=0)) for data in widths]
     of_training = [data.rows(data.stretch < len(first)) for data in widths]
-    curves = input_delays(first, longest=longest, rigid=rigid, widths=of_training)
+    motors = structure is None and {*source.u.units} <= _OF_MOTORS
+    curves = input_delays(first, longest=longest, rigid=rigid, widths=of_training, motors=motors)
     if not widths:
         return _Answers([], curves, [0.0] * inputs, [1] * inputs)
     chosen = [widths[k] for k in compared(widths)]

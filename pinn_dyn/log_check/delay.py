@@ -4,16 +4,20 @@ A candidate d is judged by the share that an equation of motion leaves unexplain
 
     inverse dynamics    u_i(t - d_i) = f_i(q, v, a),    with at most as many inputs as q
     rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if there is a structure
-    increments          v = f(q) + B(u(t - d)),         overdamped robots with more inputs
-    acceleration        a = f(q, v) + B(u(t - d)),      robots with more inputs
+    motion of motors    v = f(q, u(t - d)) - T(q) a,    if motors move the robot
 
-f and B are linear in their parameters (least squares). Noise of the acceleration makes inertias too
-small, and a delay would make up for it: kernels that leave too much noise are not used. The form
-and width count whose estimate varies least when parts of the data are left out in turn (jackknife).
+Motors move a robot with more inputs than q, or with positions or pressures as inputs. f is a
+polynomial, of third order if the data are enough for it. An inertia acts like a delay, and makes up
+for errors of f like a delay: if T explains more, the delay is between those without and with T.
+
+Noise of the acceleration makes inertias too small, and a delay would make up for it: kernels that
+leave too much noise are not used. The form and width count whose estimate varies least when parts
+of the data are left out in turn (jackknife).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,15 +25,15 @@ import numpy as np
 import scipy
 
 from pinn_dyn.data.logs import Recording
-from pinn_dyn.log_check.averages import Averages, averages_of_widths, with_products
+from pinn_dyn.log_check.averages import Averages, averages_of_widths
 from pinn_dyn.log_check.equation import (
     GROUPS,
+    RICH,
     EquationOfMotionRegression,
     Regressor,
     bodies,
     force_columns,
     tenths,
-    terms,
 )
 
 _CANDIDATES = 60  # at most: a parabola finds what is between them
@@ -37,10 +41,12 @@ _DEPTH = 0.8  # largest residual as a share of its median
 _SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 ms
 _UNEXPLAINED = 0.4  # largest residual
 _WORSE = 2.0  # residual over that of the best equation of motion, beyond which it is left out
+_LITTLE = 0.7  # residual with inertia over that without, from which inertia explains little
 FEWEST = 20 * GROUPS
 """Smallest number of rows of a regression."""
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
+_LIGHT, _HEAVY = "motion without inertia", "motion with inertia"
 _ONE_LINE = 0.995  # of the power of a signal
 INTERVAL = 2.26
 """Half width of a 95 % interval in units of the jackknife's spread (Student, 9 degrees)."""
@@ -94,14 +100,17 @@ def input_delays(
     longest: float = 0.3,
     rigid: Regressor | None = None,
     widths: Sequence[Averages] | None = None,
+    motors: bool = False,
 ) -> list[DelayCurve]:
-    """Estimate the delay of each input, or one for all if there are more inputs than coordinates.
+    """Estimate the delay of each input, or one for all of a robot that motors move.
 
     Args:
         recordings: stretches of one uniform sample time.
         longest: longest delay that is tried, s.
         rigid: regressor Y of a rigid robot with one input per joint, or None.
         widths: averages of the recordings with several kernels; None computes them.
+        motors: true if the inputs are positions or pressures of motors. More inputs than
+            coordinates always are.
 
     Raises:
         LogError: if a clock is not uniform.
@@ -110,11 +119,11 @@ def input_delays(
     inputs, size = recordings[0].u.shape[1], recordings[0].q.shape[1]
     if not inputs:
         return []
+    motors = motors or inputs > size
     stride = max(1, round(longest / step / _CANDIDATES))
     candidates = stride * step * np.arange(-2, max(round(longest / step / stride), 3) + 1)
     if widths is None:
-        parts = [with_products(x) for x in recordings] if inputs > size else recordings
-        widths = averages_of_widths(parts, step)
+        widths = averages_of_widths(recordings, step)
     trials = [
         data.rows((data.since >= candidates[-1]) & (data.left >= -candidates[0])) for data in widths
     ]
@@ -124,14 +133,17 @@ def input_delays(
         return [DelayCurve(candidates, ones, None, np.inf, "none", short)] * inputs
     forms: dict[str, list[list[DelayCurve]]] = {}
     for data in trials:
-        for form, curves in _curves(data, inputs, rigid, candidates).items():
+        for form, curves in _curves(data, inputs, rigid, candidates, motors).items():
             forms.setdefault(form, []).append(curves * (inputs // len(curves)))
     best = {
         form: [_best(curves) for curves in zip(*trials, strict=True)]
         for form, trials in forms.items()
     }
     of_bodies = best.pop(_RIGID, None)
-    curves = _agreed(list(best.values()), step)
+    if motors:
+        curves = [_between(*pair) for pair in zip(best[_LIGHT], best[_HEAVY], strict=True)]
+    else:
+        curves = best[_INVERSE]
     if of_bodies is not None:
         pairs = zip(curves, of_bodies, strict=True)
         curves = [_better(generic, rigid_curve, step) for generic, rigid_curve in pairs]
@@ -181,21 +193,21 @@ def _better(generic: DelayCurve, rigid: DelayCurve, step: float) -> DelayCurve:
     return replace(best, other=other if differ else None)
 
 
-def _agreed(forms: Sequence[list[DelayCurve]], step: float) -> list[DelayCurve]:
-    """Return the curves of the clearest equation, without delays that an equally good one denies.
-
-    A delay makes up for terms that a worse equation of motion lacks, such as inertia.
-    """
-    left = [np.mean([x.residual.min() for x in curves]) for curves in forms]
-    good = [x for x, share in zip(forms, left, strict=True) if share <= _WORSE * min(left)]
-    curves = min(good, key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
-    for alternative in good:
-        for k, (x, y) in enumerate(zip(curves, alternative, strict=True)):
-            width = step + INTERVAL * np.hypot(x.spread, y.spread)
-            if x.delay is not None and y.delay is not None and abs(x.delay - y.delay) > width:
-                reason = f"{x.form} and {y.form} disagree, {x.delay:.3g} and {y.delay:.3g} s"
-                curves[k] = replace(x, delay=None, reason=reason)
-    return curves
+def _between(light: DelayCurve, heavy: DelayCurve) -> DelayCurve:
+    """Return the delay without inertia if that explains little, or a delay that covers both."""
+    if light.delay is None:
+        return light
+    other = max(minimum(heavy.candidates, heavy.residual), 0.0)
+    mean, apart = (light.delay + other) / 2, abs(light.delay - other)
+    if apart > mean:
+        texts = [f"{1e3 * x:.0f} ms by {c.form}" for x, c in ((light.delay, light), (other, heavy))]
+        return light.without(" and ".join(texts))
+    if heavy.residual.min() > _LITTLE * light.residual.min():
+        return light
+    if heavy.delay is None:
+        return light.without(heavy.reason)
+    spread = np.hypot(max(light.spread, heavy.spread), apart / 2 / INTERVAL)
+    return replace(light, delay=mean, spread=float(spread))
 
 
 def _best(curves: Sequence[DelayCurve]) -> DelayCurve:
@@ -217,15 +229,12 @@ def _is_sine(x: np.ndarray) -> bool:
 
 
 def _curves(
-    data: Averages, inputs: int, rigid: Regressor | None, candidates: np.ndarray
+    data: Averages, inputs: int, rigid: Regressor | None, candidates: np.ndarray, motors: bool
 ) -> dict[str, list[DelayCurve]]:
-    """Return a curve of each input in each form of the equation; or one for all inputs."""
+    """Return a curve of each input in each form of the equation; or one for all of motors."""
     size = data.q.shape[1]
-    if inputs > size:
-        return {
-            form: [_motion_curve(data, form, motion, candidates)]
-            for form, motion in (("increments", data.v), ("acceleration", data.a))
-        }
+    if motors:
+        return {form: [_motion_curve(data, form, inputs, candidates)] for form in (_LIGHT, _HEAVY)}
     forms = {_INVERSE: [_input_curve(data, i, None, candidates) for i in range(inputs)]}
     regressor = bodies(data, rigid) if inputs == size else None
     if regressor is not None:
@@ -261,20 +270,33 @@ def _input_curve(
     return _curve(candidates, shares, friction, form)
 
 
-def _motion_curve(
-    data: Averages, form: str, motion: np.ndarray, candidates: np.ndarray
-) -> DelayCurve:
-    """Return the curve of all inputs by v or a ``(R, N)``."""
-    spread = motion.std(axis=0).clip(min=1e-300)
-    columns = {"terms": terms(data, form), "motion": (motion - motion.mean(axis=0)) / spread}
-    times = data.t[:, None] - candidates
-    inputs = np.stack([data.input_at(i, times) for i in range(data.u.shape[1])], axis=2)
-    columns |= {f"u{k}": inputs[:, k] for k in range(len(candidates))}
-    regression = EquationOfMotionRegression(columns, tenths(data))
-    weights = regression.jackknife()
-    fits = [regression.fit("motion", ["terms", f"u{k}"], weights) for k in range(len(candidates))]
-    shares = np.stack([fit.shares().mean(axis=1) for fit in fits], axis=1)
-    return _curve(candidates, shares, np.full_like(shares, np.nan), form)
+def _motion_curve(data: Averages, form: str, inputs: int, candidates: np.ndarray) -> DelayCurve:
+    """Return the curve of all inputs of a robot that motors move."""
+    motion = (data.v - data.v.mean(axis=0)) / data.v.std(axis=0).clip(min=1e-300)
+    inertia = np.hstack([data.a, *(data.a * q[:, None] for q in data.q.T)])
+    rows, shares = data.independent_rows(), []
+    for delay in candidates:
+        u = [data.input_at(i, data.t - delay) for i in range(inputs)]
+        columns = {"f": _polynomial(np.column_stack([data.q, *u]), rows), "motion": motion}
+        columns |= {"inertia": inertia} if form == _HEAVY else {}
+        regression = EquationOfMotionRegression(columns, tenths(data))
+        names = [name for name in columns if name != "motion"]
+        fit = regression.fit("motion", names, regression.jackknife())
+        shares.append(fit.shares().mean(axis=1))
+    residual = np.stack(shares, axis=1)
+    return _curve(candidates, residual, np.full_like(residual, np.nan), form)
+
+
+def _polynomial(x: np.ndarray, rows: int) -> np.ndarray:
+    """Return products of standardized columns up to order 3, or as far as rows determine them."""
+    x = (x - x.mean(axis=0)) / x.std(axis=0).clip(min=1e-300)
+    columns = [np.ones(len(x)), *x.T]
+    for order in (2, 3):
+        products = list(itertools.combinations_with_replacement(x.T, order))
+        if RICH * (len(columns) + len(products)) > rows:
+            break
+        columns += [np.prod(factors, axis=0) for factors in products]
+    return np.column_stack(columns)
 
 
 def _curve(
