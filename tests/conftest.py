@@ -25,7 +25,7 @@ LONG = (
     # Of make test-slow.
     *("test_notebooks", "test_slurm", "test_wheel", "test_workers", "test_integrators"),
     *("test_random_chains", "test_export", "test_known_laws", "test_gradients", "test_learner"),
-    *("test_every_model", "test_delay", "test_rigid_chain", "test_wide_range", "test_robot"),
+    *("test_every_model", "test_delay", "test_rigid_chain", "test_robot"),
 )
 
 

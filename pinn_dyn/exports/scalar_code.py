@@ -108,8 +108,6 @@ class ScalarTerms:
     def _clone(self, a: Term) -> Term:
         return a
 
-    __to_copy = _clone
-
     def _pow(self, a: Term, b: Term) -> Term:
         if self.value(b) == 2:
             return self.apply("mul", a, a)

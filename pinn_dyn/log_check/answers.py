@@ -41,6 +41,8 @@ from pinn_dyn.models.structure import Structure
 
 SECTION = "docs/bags_and_other_logs.md#is-the-log-good-enough"
 """Section of the documentation about the check of a log."""
+OF_MOTORS = {"rad", "m", "Pa"}
+"""Units of motor angles, lengths of tendons, and pressures."""
 _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
 _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _FITS = 0.1  # usual residual of a window, below which no other equation is tried
@@ -80,6 +82,11 @@ class Log:
     def square(self) -> bool:
         """True for an input per coordinate."""
         return len(self.source.u.columns) == len(self.source.q.columns)
+
+    @property
+    def motors(self) -> bool:
+        """True if the inputs are positions or pressures of motors of a soft robot."""
+        return self.structure is None and {*self.source.u.units} <= OF_MOTORS
 
     @cached_property
     def rigid(self) -> Regressor | None:
@@ -171,8 +178,13 @@ def _are_bad(measurements: Sequence[Measurement], *names: str) -> bool:
 def _asked(log: Log, widths: Sequence[Averages]) -> Answers:
     """Ask for the order, the faults and the delays of the inputs, and compare the runs."""
     source, rigid = log.source, log.rigid
-    training, longest = log.of_training(widths), log.longest_delay
-    curves = input_delays(log.parts, longest=longest, rigid=rigid, widths=training)
+    curves = input_delays(
+        log.parts,
+        longest=log.longest_delay,
+        rigid=rigid,
+        widths=log.of_training(widths),
+        motors=log.motors,
+    )
     if not widths:
         return Answers(curves, [0.0] * len(curves), [1] * len(curves), [])
     chosen, order = [widths[k] for k in compared(widths)], None

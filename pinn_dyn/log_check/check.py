@@ -19,7 +19,7 @@ from pinn_dyn.data.logs.check.plausibility import STATE
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import round_rate
 from pinn_dyn.identification.rigid_excitation import MOST, RigidExcitation, rigid_excitation
-from pinn_dyn.log_check.answers import SECTION, Answers, Log, ask
+from pinn_dyn.log_check.answers import OF_MOTORS, SECTION, Answers, Log, ask
 from pinn_dyn.log_check.averages import compared, white_noise
 from pinn_dyn.log_check.delay import INTERVAL, DelayCurve, are_held
 from pinn_dyn.log_check.figures import residuals
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
 _OUTSIDE = 0.05  # share of the test outside the range of the training
-_OF_MOTORS = {"rad", "m", "Pa"}  # units of motor angles, lengths of tendons, and pressures
 _FORCES = {"Nm", "N", "A", "V"}
 _TURNED = np.pi / 2  # rad per sample, above which no step fits
 # Column of the table of coordinates, its upper limit, and the text beyond it.
@@ -172,7 +171,7 @@ def _candidates(
     if fast:
         reason = "angles turn too far between two samples for an equation of motion"
         return [(reason, ["model=mlp"])]
-    if structure is None and units and units <= _OF_MOTORS:
+    if structure is None and units and units <= OF_MOTORS:
         reason = (
             "the inputs are positions or pressures of motors, no forces: a soft robot has more "
             "modes than coordinates"

@@ -4,16 +4,20 @@ A candidate d is judged by the share that an equation of motion leaves unexplain
 
     inverse dynamics    u_i(t - d_i) = f_i(q, v, a),    with at most as many inputs as q
     rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if there is a structure
-    increments          v = f(q) + B(u(t - d)),         overdamped robots with more inputs
-    acceleration        a = f(q, v) + B(u(t - d)),      robots with more inputs
+    motion of motors    v = f(q, u(t - d)) - T(q) a,    if motors move the robot
 
-f and B are linear in their parameters (least squares). Noise of the acceleration makes inertias too
-small, and a delay would make up for it: kernels that leave too much noise are not used. The form
-and width count whose estimate varies least when parts of the data are left out in turn (jackknife).
+Motors move a robot with more inputs than q, or with positions or pressures as inputs. f is a
+polynomial, of third order if the data are enough for it. An inertia acts like a delay, and makes up
+for errors of f like a delay: if T explains more, the delay is between those without and with T.
+
+Noise of the acceleration makes inertias too small, and a delay would make up for it: kernels that
+leave too much noise are not used. The form and width count whose estimate varies least when parts
+of the data are left out in turn (jackknife).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,14 +25,14 @@ import numpy as np
 import scipy
 
 from pinn_dyn.data.logs import Recording
-from pinn_dyn.log_check.averages import Averages, averages_of_widths, with_products
+from pinn_dyn.log_check.averages import Averages, averages_of_widths
 from pinn_dyn.log_check.equation import (
     GROUPS,
+    RICH,
     EquationOfMotionRegression,
     Regressor,
     force_columns,
     tenths,
-    terms,
 )
 
 _CANDIDATES = 60  # at most: a parabola finds what is between them
@@ -36,10 +40,12 @@ _DEPTH = 0.8  # largest residual as a share of its median
 _SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 ms
 _UNEXPLAINED = 0.4  # largest residual
 _WORSE = 2.0  # residual over that of the best equation of motion, beyond which it is left out
+_LITTLE = 0.7  # residual with inertia over that without, from which inertia explains little
 FEWEST = 20 * GROUPS
 """Smallest number of rows of a regression."""
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
-_INVERSE, _RIGID, _OF_STATES = "inverse dynamics", "rigid bodies", ("increments", "acceleration")
+_INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
+_LIGHT, _HEAVY = "motion without inertia", "motion with inertia"
 _ONE_LINE = 0.995  # of the power of a signal
 INTERVAL = 2.26
 """Half width of a 95 % interval in units of the jackknife's spread (Student, 9 degrees)."""
@@ -93,14 +99,17 @@ def input_delays(
     longest: float = 0.3,
     rigid: Regressor | None = None,
     widths: Sequence[Averages] | None = None,
+    motors: bool = False,
 ) -> list[DelayCurve]:
-    """Estimate the delay of each input, or one for all if there are more inputs than coordinates.
+    """Estimate the delay of each input, or one for all of a robot that motors move.
 
     Args:
         recordings: stretches of one uniform sample time.
         longest: longest delay that is tried, s.
         rigid: regressor Y of a rigid robot with one input per joint, or None.
         widths: averages of the recordings with several kernels; None computes them.
+        motors: true if the inputs are positions or pressures of motors. More inputs than
+            coordinates always are.
 
     Raises:
         LogError: if a clock is not uniform.
@@ -109,11 +118,11 @@ def input_delays(
     inputs, size = recordings[0].u.shape[1], recordings[0].q.shape[1]
     if not inputs:
         return []
+    motors = motors or inputs > size
     stride = max(1, round(longest / step / _CANDIDATES))
     candidates = stride * step * np.arange(-2, max(round(longest / step / stride), 3) + 1)
     if widths is None:
-        parts = [with_products(x) for x in recordings] if inputs > size else recordings
-        widths = averages_of_widths(parts, step)
+        widths = averages_of_widths(recordings, step)
     trials = [
         data.rows((data.since >= candidates[-1]) & (data.left >= -candidates[0])) for data in widths
     ]
@@ -121,9 +130,12 @@ def input_delays(
     if not trials:
         ones, short = np.ones(len(candidates)), "the stretches are too short"
         return [DelayCurve(candidates, ones, None, np.inf, "none", short)] * inputs
-    if inputs > size:
-        forms = [[_motion_curve(data, form, candidates) for data in trials] for form in _OF_STATES]
-        curves = [_agreed([_best(x) for x in forms], step)] * inputs
+    if motors:
+        light, heavy = (
+            _best([_motion_curve(data, form, inputs, candidates) for data in trials])
+            for form in (_LIGHT, _HEAVY)
+        )
+        curves = [_between(light, heavy)] * inputs
     else:
         bodies = []
         if rigid is not None and inputs == size:
@@ -165,20 +177,21 @@ def are_held(curves: Sequence[DelayCurve], step: float) -> bool:
     return len(delays) > 0 and bool((np.abs(delays - step / 2) + widths < step / 4).all())
 
 
-def _agreed(curves: Sequence[DelayCurve], step: float) -> DelayCurve:
-    """Return the curve of the clearest equation, without a delay that an equally good one denies.
-
-    A delay makes up for terms that a worse equation of motion lacks, such as inertia.
-    """
-    least = min(x.residual.min() for x in curves)
-    good = [x for x in curves if x.residual.min() <= _WORSE * least]
-    best = min(good, key=lambda x: (x.delay is None, x.spread))
-    for other in good:
-        if best.delay is None or other.delay is None:
-            continue
-        if abs(best.delay - other.delay) > step + INTERVAL * np.hypot(best.spread, other.spread):
-            return best.without(f"{best.form} and {other.form} disagree")
-    return best
+def _between(light: DelayCurve, heavy: DelayCurve) -> DelayCurve:
+    """Return the delay without inertia if that explains little, or a delay that covers both."""
+    if light.delay is None:
+        return light
+    other = max(minimum(heavy.candidates, heavy.residual), 0.0)
+    mean, apart = (light.delay + other) / 2, abs(light.delay - other)
+    if apart > mean:
+        texts = [f"{1e3 * x:.0f} ms by {c.form}" for x, c in ((light.delay, light), (other, heavy))]
+        return light.without(" and ".join(texts))
+    if heavy.residual.min() > _LITTLE * light.residual.min():
+        return light
+    if heavy.delay is None:
+        return light.without(heavy.reason)
+    spread = np.hypot(max(light.spread, heavy.spread), apart / 2 / INTERVAL)
+    return replace(light, delay=mean, spread=float(spread))
 
 
 def _force_curve(
@@ -236,18 +249,32 @@ def _input_curve(
     return _curve(candidates, shares, friction, form)
 
 
-def _motion_curve(data: Averages, form: str, candidates: np.ndarray) -> DelayCurve:
-    """Return the curve of all inputs by v or a."""
-    motion = data.v if form == "increments" else data.a
-    spread = motion.std(axis=0).clip(min=1e-300)
-    columns = {"terms": terms(data, form), "motion": (motion - motion.mean(axis=0)) / spread}
-    times = data.t[:, None] - candidates
-    inputs = np.stack([data.input_at(i, times) for i in range(data.u.shape[1])], axis=2)
-    columns |= {f"u{k}": inputs[:, k] for k in range(len(candidates))}
-    regression = EquationOfMotionRegression(columns, tenths(data))
-    fits = [regression.fit("motion", ["terms", f"u{k}"]) for k in range(len(candidates))]
-    shares = np.stack([fit.shares.mean(axis=1) for fit in fits], axis=1)
-    return _curve(candidates, shares, np.full_like(shares, np.nan), form)
+def _motion_curve(data: Averages, form: str, inputs: int, candidates: np.ndarray) -> DelayCurve:
+    """Return the curve of all inputs of a robot that motors move."""
+    motion = (data.v - data.v.mean(axis=0)) / data.v.std(axis=0).clip(min=1e-300)
+    inertia = np.hstack([data.a, *(data.a * q[:, None] for q in data.q.T)])
+    rows, shares = len(data.independent(1.0)), []
+    for delay in candidates:
+        u = [data.input_at(i, data.t - delay) for i in range(inputs)]
+        columns = {"f": _polynomial(np.column_stack([data.q, *u]), rows), "motion": motion}
+        columns |= {"inertia": inertia} if form == _HEAVY else {}
+        regression = EquationOfMotionRegression(columns, tenths(data))
+        names = [name for name in columns if name != "motion"]
+        shares.append(regression.fit("motion", names).shares.mean(axis=1))
+    residual = np.stack(shares, axis=1)
+    return _curve(candidates, residual, np.full_like(residual, np.nan), form)
+
+
+def _polynomial(x: np.ndarray, rows: int) -> np.ndarray:
+    """Return products of standardized columns up to order 3, or as far as rows determine them."""
+    x = (x - x.mean(axis=0)) / x.std(axis=0).clip(min=1e-300)
+    columns = [np.ones(len(x)), *x.T]
+    for order in (2, 3):
+        products = list(itertools.combinations_with_replacement(x.T, order))
+        if RICH * (len(columns) + len(products)) > rows:
+            break
+        columns += [np.prod(factors, axis=0) for factors in products]
+    return np.column_stack(columns)
 
 
 def _curve(

@@ -14,7 +14,8 @@ Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 GROUPS = 10
 """Parts of the data that a jackknife leaves out in turn."""
 _RIDGE = 1e-9
-_RICH = 3  # independent rows at least for a term of a rich equation
+RICH = 3
+"""Smallest number of independent rows for a term of a rich equation."""
 _MOST = 400  # terms, for the time that a regression takes
 
 
@@ -123,7 +124,7 @@ def terms(data: Averages, form: str) -> np.ndarray:
             (trig[:, :, None] * x[:, None, :]).reshape(len(x), -1) for x in [*inertial, trig[:, 1:]]
         ]
         count = sum(x.shape[1] for x in products)
-        rich = _RICH * count < len(data.independent(1.0)) and count < _MOST
+        rich = RICH * count < len(data.independent(1.0)) and count < _MOST
         parts += products if rich else inertial
     return np.hstack(parts)
 

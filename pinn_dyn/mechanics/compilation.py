@@ -6,7 +6,6 @@ import copy
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +14,7 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from pinn_dyn.mechanics.integrators import RK4, Dynamics, Integrator, Wrapped
+from pinn_dyn.mechanics.integrators import Dynamics, Integrator, Wrapped
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
 
@@ -58,12 +57,11 @@ class CompiledDynamics(Wrapped):
     def __init__(self, inner: Integrator, dynamics: Dynamics):
         super().__init__(inner)
         _keep_rows()
-        self._compiled: Any = SimpleNamespace()  # compiled at the first call
-        if isinstance(inner, RK4):  # its derivative alone compiles faster than its four stages
-            self._compiled.state_derivative = torch.compile(dynamics.state_derivative)
-            self._compiled.integration_step = partial(inner.step, self._compiled)
-        else:
-            self._compiled.integration_step = torch.compile(dynamics.integration_step)
+        # Compiled at the first call. A method calls only one of the two.
+        self._compiled = SimpleNamespace(
+            state_derivative=torch.compile(dynamics.state_derivative),
+            integration_step=torch.compile(dynamics.integration_step),
+        )
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         return self.inner.path(self._compiled, start, grid, signal)

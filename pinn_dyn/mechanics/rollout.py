@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,7 +33,6 @@ def rollout(
     """
     require_start(x0, t, input)
     flow: Any = SimpleNamespace(state_derivative=derivative)
-    flow.integration_step = partial(RK4().step, flow)
     return x0.unsqueeze(-2) + path_between(flow, RK4(substeps), x0, t, input)
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pinn_dyn.mechanics import Signal
+from pinn_dyn.mechanics.integrators import Wrapped
 from pinn_dyn.testing.finite_differences import assert_near, partial_derivatives
 from pinn_dyn.testing.linear_system import damped_oscillators, exact_solution
 
@@ -51,9 +52,12 @@ class IntegratorContract:
         size = 2 ** kind(1).order
         assert all(0.7 * size < a / b < 1.4 * size for a, b in itertools.pairwise(errors)), errors
 
-    def test_a_path_starts_at_zero(self, kind, system):
-        t, u = samples(count=3, step=0.02)
-        path = increments(system, kind(1), START, t, Signal(t, u))
+    def test_path_equals_the_single_steps(self, kind, system):
+        t, u = samples(count=90, step=0.02)
+        signal = Signal(t, u)
+        path = increments(system, kind(1), START, t, signal)
+        steps = increments(system, Wrapped(kind(1)), START, t, signal)
+        torch.testing.assert_close(path, steps, rtol=0, atol=1e-12)
         assert torch.equal(path[0], torch.zeros_like(START))
 
     @pytest.mark.parametrize("interpolation", ["hold", "linear", "cubic"])

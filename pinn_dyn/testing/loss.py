@@ -9,6 +9,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.data import Windows
 from pinn_dyn.mechanics import RK4, Signal
+from pinn_dyn.mechanics.integrators import Wrapped
 from pinn_dyn.models import LagrangianNetwork, NetworkCholesky, NetworkInput, NetworkPotential
 
 STEP = 0.02
@@ -71,7 +72,7 @@ class WindowLossContract:
         torch.testing.assert_close(value, torch.stack(alone).mean())
 
     def test_loss_can_be_traced(self, loss, model):
-        model.integrator = RK4()
+        model.integrator = Wrapped(RK4())
         windows, different = random_windows(4), random_windows(4, seed=1)
 
         def function(q, v, dq, dv, u):

@@ -14,7 +14,8 @@ from torch.func import functional_call
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, State
-from pinn_dyn.mechanics.compilation import compile_graph
+from pinn_dyn.mechanics.compilation import compile_graph, integrated_by
+from pinn_dyn.mechanics.integrators import Wrapped
 from pinn_dyn.models.learned_constants import Called
 from pinn_dyn.training.losses import WindowLoss
 from pinn_dyn.training.parameter_vector import MOVED, CompiledAdamW, ParameterVector
@@ -54,7 +55,11 @@ class LossProgram:
     """
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector):
-        self._loss, self._state = Called(model, lambda x, windows: loss(x, windows)), model.state
+        def traceable(model: ContinuousPredictor, windows: Any) -> Tensor:
+            with integrated_by(model, Wrapped(model.integrator)):
+                return loss(model, windows)
+
+        self._loss, self._state = Called(model, traceable), model.state
         self._names = [f"model.{name}" for name, _ in model.named_parameters()]
         self._vector = vector
         self._programs: dict[tuple[Any, ...], Program] = {}

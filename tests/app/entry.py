@@ -117,21 +117,16 @@ def refused_text(capsys, script, *arguments):
     return text
 
 
-def fork_script(script, *arguments, folder, output, own_session=False, anew=False):
+def fork_script(script, *arguments, folder, output, own_session=False):
     """Run an entry script in a copy of this process, with its output going to a file.
 
-    The copy has imported PyTorch, which takes a program of its own six seconds; ``anew`` makes it
-    one, as joblib's workers need at its end.
+    The copy has imported PyTorch, which takes a program of its own six seconds.
     """
 
     def work():
         if own_session:
             os.setsid()
         os.chdir(folder)
-        if anew:
-            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-            words = [sys.executable, str(ROOT / script), *arguments]
-            os.execve(sys.executable, words, environment)
         run_script(script, *arguments, checked=True)
 
     return fork(work, output)

@@ -9,8 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from pinn_dyn import load
-from pinn_dyn.app.check import _training
-from pinn_dyn.models import CoulombFriction, ElasticJoints, KnownMechanics, Servo
+from pinn_dyn.models import CoulombFriction, ElasticJoints, Servo
 from tests.app.entry import NO_FIGURES, ROOT, fails, run_script
 from tests.support.delayed_robots import log, resting
 
@@ -85,36 +84,6 @@ def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
     effects, unit = "targets of servos.*", "dataset.u.unit=rad"
     model = printed_training(tmp_path, capsys, pd.DataFrame(table), effects, unit)
     assert isinstance(model.input, Servo)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_the_printed_training_identifies_the_structure_of_the_check(tmp_path, capsys):
-    item = resting(0.3)
-    table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
-    table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
-    settings = structure("double_pendulum")
-    model = printed_training(tmp_path, capsys, pd.DataFrame(table), "its constants", *settings)
-    assert isinstance(model, KnownMechanics)
-    assert len(model.structure.joint_names) == 2
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_no_training_is_printed_where_an_angle_turns_too_far_in_a_sample(tmp_path, capsys):
-    item = resting(0.3)
-    q = 60 * item.q  # up to 370 rad/s at 200 Hz
-    table = {"t": item.t, "q1": q[:, 0], "q2": q[:, 1], "u1": item.u[:, 0], "u2": item.u[:, 1]}
-    words = arguments(tmp_path)
-    pd.DataFrame(table).to_csv(tmp_path / "arm.csv", index=False)
-    run_script("check.py", *words)
-    text = capsys.readouterr().out
-    assert "Options of a training" not in text
-    assert "a training with" not in text
-
-
-def test_only_the_program_changes_in_the_printed_training(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["checks/check.py", "dataset=check_1"])
-    command = "python checks/train.py dataset=check_1 model=lnn model/friction=coulomb"
-    assert _training(["model=lnn", "model/friction=coulomb"]) == command
 
 
 def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):

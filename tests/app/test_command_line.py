@@ -10,7 +10,7 @@ import torch
 
 from pinn_dyn.app.command import COMMANDS, main
 from pinn_dyn.app.config import completed, composed
-from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, refused_text, run_script
+from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, refused_text
 
 
 @pytest.fixture(autouse=True)
@@ -32,13 +32,10 @@ def test_an_option_that_a_shipped_option_hides_is_refused(elsewhere, capsys):
 @pytest.mark.parametrize(
     ("script", "mistake", "meant"),
     [
-        ("train.py", "data.pair=64", "data.pairs"),
         ("train.py", "trainer.step=1", "trainer.steps"),
         ("train.py", "optimiser.lr=0.1", "optimizer"),
-        ("train.py", "sed=1", "seed"),
         ("train.py", "weight_decay=1", "optimizer.weight_decay"),
         ("check.py", "longest_dely=1", "longest_delay"),
-        ("evaluate.py", "run=[runs/here]", "runs"),
     ],
 )
 def test_a_misspelt_key_is_answered_with_the_right_one(elsewhere, script, mistake, meant):
@@ -117,11 +114,6 @@ def test_a_missing_compiler_or_device_is_refused_before_data_are_made(
     assert message in refused_text(capsys, "train.py", *TINY, NO_FIGURES, word)
 
 
-def test_a_folder_without_a_run_cannot_be_resumed(elsewhere, capsys):
-    text = refused_text(capsys, "train.py", "resume=empty")
-    assert "empty/checkpoints/last.ckpt does not exist: this is no run folder" in text
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_of_an_installed_command_names_the_command(capsys, monkeypatch, command):
     monkeypatch.setattr("sys.argv", [f"/usr/bin/pinn-dyn-{command}", "--help"])
@@ -137,24 +129,6 @@ def test_help_ends_quietly_in_a_pipe_that_closes():
     with Popen([sys.executable, "-c", f"{code}; train()"], stdout=PIPE, stderr=PIPE) as process:
         process.stdout.close()
         assert process.stderr.read() == b""
-
-
-@pytest.mark.parametrize(
-    ("script", "examples"),
-    [
-        ("train.py", ["python train.py experiment=", "python train.py -m ", "resume="]),
-        ("evaluate.py", ["python evaluate.py runs="]),
-    ],
-)
-def test_help_shows_examples_and_the_configuration(elsewhere, capsys, script, examples):
-    with pytest.raises(SystemExit) as caught:
-        run_script(script, "--help")
-    assert caught.value.code in (0, None)
-    text = capsys.readouterr().out
-    for example in examples:
-        assert example in text
-    assert "seed: 0" in text or "runs: ???" in text
-    assert not list(elsewhere.iterdir())
 
 
 def test_commands_of_the_same_second_write_into_different_folders():

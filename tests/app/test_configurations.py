@@ -13,11 +13,9 @@ from tests.app.entry import (
     ROOT,
     RUNS,
     STRIDE,
-    TINY,
     TINY_DATA,
     TINY_TRAINING,
     assert_trained,
-    refused_text,
     run_script,
     train,
 )
@@ -183,35 +181,6 @@ def test_a_curriculum_trains(tmp_path):
     several = ["data.steps=4", "loss.curriculum=[1,2,4]", "trainer.steps=6"]
     folder = train(tmp_path / "run", "model=lnn", *several, NO_FIGURES)
     assert_trained(folder, steps=6)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "words"),
-    [
-        (["loss=midpoint", "model=mlp"], "loss: model is a NextStateMLP"),
-        (["data.steps=3", "loss.curriculum=[1,2]"], "loss: curriculum is [1, 2]"),
-    ],
-)
-def test_a_loss_that_does_not_fit_ends_with_its_name(tmp_path, capsys, mistake, words):
-    arguments = [*TINY, *mistake, f"hydra.run.dir={tmp_path / 'run'}"]
-    assert words in refused_text(capsys, "train.py", *arguments)
-
-
-HNN_ON_A_LOG = ["experiment=example_log", "model=hnn", "compile=false", *TINY_TRAINING]
-
-
-def test_a_hamiltonian_network_on_velocities_trains_on_a_log(tmp_path, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    folder = tmp_path / "run"
-    choices = [NO_FIGURES, f"hydra.run.dir={folder}"]
-    run_script("train.py", *HNN_ON_A_LOG, *choices)
-    assert_trained(folder)
-
-
-def test_a_hamiltonian_network_on_momenta_is_told_how_to_do_without(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(ROOT)
-    words = [*HNN_ON_A_LOG, "model.state=qp", f"hydra.run.dir={tmp_path / 'run'}"]
-    assert "set model.state=qv" in refused_text(capsys, "train.py", *words)
 
 
 def test_what_the_tests_compose_faster_is_what_hydra_composes(tmp_path, kept_compositions):

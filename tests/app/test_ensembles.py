@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 import pinn_dyn
-from tests.app.entry import refused_text, run_script
+from tests.app.entry import run_script
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +53,6 @@ def test_the_run_that_validation_prefers_is_named(folders, run_of):
     assert "prefer" not in str(validation)
 
 
-def test_runs_without_another_seed_have_no_mean(tmp_path, folders, run_of, capsys):
-    runs = f"runs=[{folders[0]},{run_of('mlp')}]"
-    words = runs, "ensemble=true", f"hydra.run.dir={tmp_path}"
-    text = refused_text(capsys, "evaluate.py", *words)
-    assert "no two runs differ in the seed alone" in text
-
-
 def test_an_interval_holds_the_predictions_of_the_members(folders):
     run = pinn_dyn.ensemble([pinn_dyn.load(folder) for folder in folders])
     t = np.linspace(0, 0.05, 6)
@@ -84,10 +77,3 @@ def test_an_interval_holds_the_predictions_of_the_members(folders):
     np.testing.assert_allclose(change, scale * expected, atol=1e-6 * abs(change).max())
     assert (squares[0] > scale * squares[1]).all()
     np.testing.assert_array_equal(wide[0][0], wide[1][0])
-
-
-def test_runs_of_other_data_have_no_mean(folders, lnn_run):
-    run, other = (pinn_dyn.load(folder) for folder in folders)
-    changed = {**other.data, "test": other.data["validation"]}
-    with pytest.raises(ValueError, match="has other data than"):
-        pinn_dyn.ensemble([run, pinn_dyn.run.run.replace(other, data=changed)])

@@ -14,8 +14,7 @@ from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
 from tests.models.builders import VARIANTS, make_structured
 from tests.support.closed_loops import Vanishing
 from tests.support.known import known_model
-from tests.support.simulated_arms import simulated_by
-from tests.support.urdf_by_hand import SPATIAL
+from tests.support.simulated_arms import SPATIAL, simulated_by
 
 gymnasium = pytest.importorskip("gymnasium", reason="the envs extra is not installed")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
@@ -85,15 +84,6 @@ def test_a_learned_robot_moves_as_its_model_predicts(run):
         q, p = expected.chunk(2, -1)
         expected = torch.cat([q, run.model.velocity(q, p)], -1)
     torch.testing.assert_close(states, expected, rtol=0, atol=1e-10)
-
-
-def test_longer_steps_are_integrated_in_those_of_the_training(lnn_run):
-    run = pinn_dyn.load(lnn_run)
-    fine = RobotEnv(run)
-    (action,) = actions_of(fine, 1)
-    coarse = rolled_out(RobotEnv(run, step=3 * fine.dt), [action])
-    expected = rolled_out(fine, [action] * 3)[[0, -1]]
-    np.testing.assert_allclose(coarse, expected, rtol=0, atol=1e-10)
 
 
 def test_the_delay_of_the_data_shifts_the_inputs(lnn_run):
@@ -177,24 +167,6 @@ def test_a_robot_that_diverges_gains_nothing():
     assert rewards[-1] == pytest.approx(left * rewards[-2])
 
 
-def test_several_environments_step_together():
-    envs = gymnasium.make_vec(
-        "pinn_dyn.envs:pinn_dyn/Robot-v0",
-        num_envs=2,
-        vectorization_mode="sync",
-        robot=damped_oscillators(),
-        data=Recorded(2, 1),
-    )
-    first, _ = envs.reset(seed=[0, 1])
-    assert (first[0] == oscillators().reset(seed=0)[0]).all()
-    assert envs.step(envs.action_space.sample())[0].shape == (2, 6)
-
-
-def test_a_robot_without_data_is_told_so():
-    with pytest.raises(TypeError, match="set data"):
-        RobotEnv(damped_oscillators())
-
-
 def moved(model, factor):
     model = double_copy(model)
     with torch.no_grad():
@@ -246,77 +218,6 @@ def test_robots_with_other_constants_move_as_their_own_models(name, delay):
     alone.start(more[0][last:], more[1][last:])
     expected = alone.advance(u[0, -1:], 0.01)
     torch.testing.assert_close(found[0][last], expected[0][0], rtol=0, atol=1e-10)
-
-
-def test_a_vector_of_robots_repeats_the_single_robot(lnn_run):
-    """Observations, rewards and ends of robots in a row, also in the episode after the first."""
-    run = pinn_dyn.load(lnn_run)
-    env, single = RobotVectorEnv(run, 3, duration=0.05), RobotEnv(run, duration=0.05)
-    observations, _ = env.reset(seed=0)
-    env.action_space.seed(0)
-    size = observations.shape[1] // 3
-    is_over = np.zeros(3, dtype=bool)
-    single.reset()
-    for _ in range(2 * env.steps + 1):
-        actions, before = 2 * env.action_space.sample(), observations  # beyond the limits
-        observations, rewards, terminated, truncated, _ = env.step(actions)
-        for k in range(3):
-            if is_over[k]:  # the action has no effect, and a new episode starts
-                assert rewards[k] == 0
-                assert (observations[k] != before[k]).reshape(3, -1).any(1).all()  # q, v, goal
-                continue
-            single.reset()
-            single._robots._q, single._robots._v, single._robots._goal = before[k].reshape(3, 1, -1)
-            single.plant.start(*map(torch.from_numpy, (single._robots._q, single._robots._v)))
-            expected, reward, ended, _, info = single.step(actions[k])
-            np.testing.assert_allclose(observations[k], expected, rtol=0, atol=1e-10)
-            assert rewards[k] == pytest.approx(reward, abs=1e-10)
-            assert terminated[k] == ended
-            assert env.distances()[k] == pytest.approx(info["distance"], abs=1e-8)
-        is_over = terminated | truncated
-    assert size == run.model.num_coordinates
-    assert env.observation_space.contains(observations)
-
-
-def test_robots_may_start_again_in_the_same_step(lnn_run):
-    run = pinn_dyn.load(lnn_run)
-    later, same = (
-        RobotVectorEnv(run, 2, duration=0.03, autoreset=mode)
-        for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
-    )
-    for env in (later, same):
-        env.reset(seed=3)
-        env.action_space.seed(0)
-    for _ in range(later.steps):
-        actions = later.action_space.sample()
-        expected, *_ = later.step(actions)
-        started, _, terminated, truncated, infos = same.step(actions)
-    assert (terminated | truncated).all()
-    np.testing.assert_array_equal(infos["final_obs"], expected)
-    assert (started != expected).any(1).all()
-    moved, rewards, *_ = same.step(actions)
-    assert (moved != started).any(1).all()
-    assert rewards.all()
-
-
-@pytest.mark.filterwarnings("ignore:overflow")
-def test_a_robot_of_a_vector_that_diverges_stays_and_starts_again():
-    model = LinearSystem([[1.0]], [[-1e9]], [[0.0]], [[1.0]])
-    env = RobotVectorEnv(ModelPlant(model, step=0.1), 2, data=Recorded(1, 1), duration=20.0)
-    env.reset(seed=0)
-    count, terminated = 0, np.zeros(2)
-    while not terminated.any():
-        last = env._observations()
-        state, rewards, terminated, _, _ = env.step(np.zeros((2, 1)))
-        count += 1
-    assert terminated.all()
-    np.testing.assert_array_equal(state, last)
-    goal = -np.square(last[:, 0] - last[:, 2])
-    np.testing.assert_allclose(rewards, goal * (env.steps - count + 1))
-    state, rewards, terminated, truncated, _ = env.step(np.zeros((2, 1)))
-    assert not (terminated | truncated).any()
-    assert (np.abs(state[:, :2]) < 2).all()
-    assert not rewards.any()
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)

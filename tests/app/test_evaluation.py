@@ -136,12 +136,6 @@ def test_runs_are_grouped_by_their_configuration_without_the_seed(
     assert "over seeds" in capsys.readouterr().out
 
 
-def test_patterns_without_runs_are_refused(tmp_path, capsys):
-    (tmp_path / "empty").mkdir()
-    for pattern in (tmp_path / "nowhere" / "*", tmp_path / "empty"):
-        assert f"'{pattern}' matches no run folder" in refused(capsys, pattern)
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_damaged_run_is_named_and_the_others_are_evaluated(tmp_path, mlp_run, capsys):
     shutil.copytree(mlp_run, tmp_path / "a")

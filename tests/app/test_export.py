@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.models import KnownMechanics, LagrangianNetwork, NoFriction, Servo, Stribeck
+from pinn_dyn.models import KnownMechanics, NoFriction, Servo, Stribeck
 from pinn_dyn.run.export import export
 from pinn_dyn.run.run_folder import with_structures
 from pinn_dyn.systems import RigidChain
@@ -201,11 +201,6 @@ def test_friction_gains_and_offsets_are_in_the_files(tmp_path):
     expected = model.constant_force() + 0.7 * model.drive_gain() * torch.tensor([0, 1])
     np.testing.assert_allclose(data.qfrc_actuator, expected, atol=1e-12)
     assert "drive gain of elbow" in (tmp_path / "arm.urdf").read_text()
-
-
-def test_a_network_has_no_robot_file(tmp_path):
-    with pytest.raises(TypeError, match="LagrangianNetwork has no robot file"):
-        export(LagrangianNetwork(statistics(2)), tmp_path / "arm.urdf")
 
 
 SHAPE = '<visual><geometry><mesh filename="meshes/upper.stl"/></geometry></visual>'

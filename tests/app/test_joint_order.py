@@ -11,7 +11,6 @@ import pinn_dyn
 from pinn_dyn.models import KnownMechanics, NoFriction
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares
-from tests.app.entry import NO_FIGURES, run_script
 from tests.support.rigid_chains import TREE
 
 JOINTS = ["turn", "slide", "bend"]
@@ -62,27 +61,3 @@ def test_a_permuted_log_gives_the_same_identification_and_predictions(frame, tmp
     for run in (permuted, loaded):
         found = run.system.forward_dynamics(q[:, here], 0.5 * q[:, here], 3 * q[:, there])
         torch.testing.assert_close(found, expected, rtol=0.02, atol=0.02)
-
-
-@pytest.mark.slow
-def test_a_permuted_log_is_checked_trained_and_evaluated_by_the_commands(frame, tmp_path):
-    frame.to_csv(tmp_path / "log.csv", index=False)
-    (tmp_path / "arm.urdf").write_text(TREE)
-    dataset = [
-        *("dataset=csv_log", f"dataset.root='{tmp_path}'", "dataset.files=log.csv"),
-        *("dataset.q.columns=[q_bend,q_turn,q_slide]", "dataset.q.unit=[rad,rad,m]"),
-        *("+dataset.v.columns=[v_bend,v_turn,v_slide]", "dataset.v.unit=[rad/s,rad/s,m/s]"),
-        *("dataset.u.columns=[u_slide,u_bend,u_turn]", "dataset.u.unit=[N,Nm,Nm]"),
-        *("+dataset.validation.seconds=2.0", "dataset.validation.piece=1.0"),
-        *("+dataset.test.seconds=2.0", "dataset.test.piece=1.0"),
-    ]
-    structure = ["model/structure=urdf", f"model.structure.urdf={tmp_path / 'arm.urdf'}"]
-    run_script("check.py", *dataset, *structure, f"hydra.run.dir={tmp_path / 'check'}")
-    fit = ["model=known", "data=multi_step", "data.pairs=100", "data.batch_size=100", NO_FIGURES]
-    fit += ["optimizer=least_squares", "optimizer.rollouts=false", "validator.horizon=0.5"]
-    run_script("train.py", *dataset, *structure, *fit, f"hydra.run.dir={tmp_path / 'run'}")
-    evaluation = [f"runs=[{tmp_path / 'run'}]", "horizon=0.5", "windows=[0.1]"]
-    run_script("evaluate.py", *evaluation, f"hydra.run.dir={tmp_path / 'evaluation'}")
-    table = pd.read_csv(tmp_path / "evaluation" / "summary.csv")
-    (row,) = table[~table.baseline & table.model.str.startswith("known")].to_dict("records")
-    assert row["error_mean"] < 0.02

@@ -77,11 +77,8 @@ PANDA = [f"panda_joint{k}" for k in (1, 2, 3)] + ["panda_finger_joint1", "panda_
     [
         (["elbow_pos", "ShoulderPan.pos", "joint1"], NAMES, [NAMES[1], NAMES[0], NAMES[2]]),
         (["q1", "elbow_joint", "x"], NAMES, NAMES),  # by their order
-        (["q1", "q2", "hip_leg"], ("arm", "hip", "leg"), ("arm", "hip", "leg")),  # names two
         (["joint10_q", "joint1_q"], ("joint1", "joint10", "joint100"), ["joint10", "joint1"]),
-        (["elbow", "joint1"], NAMES, ["elbow_joint", "joint1"]),
         (["q_3[rad]", "q_1[rad]", "q_2[rad]"], PANDA, [PANDA[2], *PANDA[:2]]),
-        (["joint1", "joint2", "joint3"], PANDA, PANDA[:3]),
         (["q2", "q1"], ["joint1", "joint2"], ["joint2", "joint1"]),
         (["joint_0", "joint_1"], ["joint1", "joint2"], ["joint1", "joint2"]),  # numbers from 0
     ],
@@ -105,7 +102,6 @@ def test_effects_of_an_mjcf_that_the_model_leaves_out_are_a_warning(caplog):
 @pytest.mark.parametrize(
     ("columns", "names"),
     [
-        (["q0", "q1"], NAMES),
         (["elbow", "x", "y"], NAMES),
         (["q1", "q2"], ["left_joint1", "left_joint2", "right_joint1", "right_joint2"]),
     ],
@@ -182,18 +178,3 @@ def test_inputs_that_are_no_forces_need_gains(unit):
     for gains in ({"drive_gain": 8.0}, {"drive_gain": [1, 8, 1]}, {"gain_spread": 0.5}):
         check_known(known(**gains), source)
     check_known(known(), log_of(["q1", "q2", "q3"], unit="1"))  # as of a data frame
-
-
-class Labelled:
-    """A source other than a log, known by its labels."""
-
-    labels = ("q1 [rad]", "q2 [rad]", "q3 [rad]")
-
-    def __init__(self, *input_labels):
-        self.input_labels = input_labels
-
-
-def test_other_sources_are_known_by_their_labels():
-    check_known(known(), Labelled("tau1 [Nm]", "tau2", "tau3 [N]"))
-    with pytest.raises(ConfigError, match=r"the inputs are i2 in A, no forces"):
-        check_known(known(), Labelled("tau1 [Nm]", "i2 [A]", "tau3"))

@@ -2,15 +2,10 @@
 
 import runpy
 import shutil
-from functools import partial
 
 import pandas as pd
 import pytest
-import torch
 
-import pinn_dyn
-from pinn_dyn.data import DynamicsData
-from pinn_dyn.evaluation import RolloutValidator
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
@@ -19,8 +14,6 @@ from tests.app.entry import (
     refused_text,
     run_script,
 )
-from tests.data import log_formats as formats
-from tests.data.logs_files import motion, source, write
 
 EXAMPLES = ROOT / "examples"
 TINY = ["experiment=example_log", "compile=false", *TINY_TRAINING, NO_FIGURES]
@@ -128,9 +121,7 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
             "dataset.q.columns=[bend_x,bend_y,strech]",
             ["example_log.csv: no column 'strech'", "did you mean stretch", "torque_y"],
         ),
-        ("dataset.q.unit=dge", ["dataset: q: unit is 'dge'", "did you mean deg"]),
         ("dataset.root=nowhere", [f"root is '{ROOT / 'nowhere'}'", "no folder"]),
-        ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
         ("dataset.test.piece=7.0", ["test: ", "no stretch lasts 7 s"]),
     ],
 )
@@ -142,27 +133,3 @@ def test_a_mistake_about_a_log_ends_with_its_name_and_place(
     for word in words:
         assert word in text
     assert not list(tmp_path.rglob("*.ckpt"))
-
-
-def test_the_preset_of_the_neck_asks_for_the_log(tmp_path, capsys):
-    words = ["dataset=neck", "data=multi_step", "model=lnn", f"hydra.run.dir={tmp_path / 'run'}"]
-    assert "no value for dataset.files" in refused_text(capsys, "train.py", *words)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_bag_and_the_same_data_as_csv_give_the_same_weights(tmp_path):
-    table = motion(6.0)
-    formats.write_bag(tmp_path / "run", table)
-    write(tmp_path, table)
-    small = dict(
-        data=partial(DynamicsData, pairs=64, steps=2, stride=1, batch_size=32),
-        validator=partial(RolloutValidator, horizon=0.1),
-        steps=3,
-    )
-    weights = []
-    for log in (source(tmp_path, files="run", **formats.BAG), source(tmp_path)):
-        weights.append(pinn_dyn.train(log, "lnn", **small).model.state_dict())
-    for name, value in weights[0].items():
-        torch.testing.assert_close(value, weights[1][name], rtol=1e-5, atol=1e-7)
-    moved = pinn_dyn.train(log, "lnn", seed=1, **small).model.state_dict()
-    assert any(not torch.allclose(value, moved[name]) for name, value in weights[0].items())

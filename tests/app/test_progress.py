@@ -45,16 +45,16 @@ def test_the_remaining_time_excludes_what_came_before_the_first_step(monkeypatch
 def test_a_training_and_its_evaluation_log_their_progress(quick, tmp_path, capsys, caplog):
     run = train(
         tmp_path / "run",
-        *("model=lnn", "trainer.steps=100", "trainer.enable_progress_bar=true", NO_FIGURES),
+        *("model=lnn", "trainer.steps=40", "trainer.enable_progress_bar=true", NO_FIGURES),
     )
     text = (run / "train.log").read_text()
     shown = capsys.readouterr().out
-    for part in ("training soft_arm_1/lnn seed 0: ", " of 100 steps, loss ", " s left"):
+    for part in ("training soft_arm_1/lnn seed 0: ", " of 40 steps, loss ", " s left"):
         assert part in text
         assert part in shown
     losses = EventAccumulator(str(run / "tensorboard")).Reload().Scalars("train/loss")
-    assert [item.step for item in losses] == list(range(1, 100, 2))
-    assert len({item.value for item in losses}) == 50
+    assert [item.step for item in losses] == list(range(1, 40, 2))
+    assert len({item.value for item in losses}) == 20
     caplog.set_level(logging.INFO)
     pinn_dyn.evaluate(pinn_dyn.load(run), horizon=0.1, windows=[])
     assert "evaluation: 0 of 5 models, now " in caplog.text
@@ -68,7 +68,7 @@ def test_a_program_without_handlers_gets_the_lines_on_stderr(quick, monkeypatch,
         q={"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]},
         u={"columns": ["torque_x", "torque_y", "force"], "unit": ["Nm", "Nm", "N"]},
         run="run",
-        steps=20,
+        steps=8,
         validations=1,
         compile=False,
     )

@@ -10,11 +10,8 @@ import pytest
 
 import pinn_dyn
 from pinn_dyn.data.logs import LogError, LogSource
-from pinn_dyn.run.configuration.validation import ConfigError
-from pinn_dyn.run.run_folder import load_run, require_no_links_out
 from pinn_dyn.systems import BulletArm, RigidChain
-from tests.app.entry import NO_FIGURES, ROOT, TINY_DATA, fails, run_script, train
-from tests.support.foreign_runs import foreign
+from tests.app.entry import ROOT
 from tests.support.rigid_chains import joint, link, robot
 
 ARM = robot(link("base"), link("rod"), joint("hinge", "continuous", "base", "rod"))
@@ -87,53 +84,6 @@ def test_the_command_for_a_xacro_file_makes_a_robot_that_loads(tmp_path, monkeyp
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     subprocess.run(command, shell=True, check=True)
     assert RigidChain("robot.urdf").joint_names == ["hinge"]
-
-
-def test_a_link_out_of_a_run_folder_is_replaced_by_a_copy(tmp_path, lnn_run):
-    run = foreign(lnn_run, tmp_path / "run", lambda config: None)
-    (tmp_path / "log.csv").write_text("a")
-    (run / "log.csv").symlink_to(tmp_path / "log.csv")
-    with pytest.raises(ConfigError, match="replace the link by a copy") as error:
-        require_no_links_out(run)
-    place, target = re.search(r"(\S+) is a link to (\S+):", str(error.value)).groups()
-    text = (tmp_path / "log.csv").read_text()
-    assert target == str(tmp_path / "log.csv")
-    (run / "log.csv").unlink()
-    (run / "log.csv").write_text(text)
-    assert place == str(run / "log.csv")
-    require_no_links_out(run)
-
-
-def test_a_trusted_logger_may_choose_where_it_writes(tmp_path, lnn_run):
-    def change(config):
-        config["logger"]["tensorboard"] = {
-            "_target_": "lightning.pytorch.loggers.CSVLogger",
-            "save_dir": str(tmp_path),
-        }
-
-    run = foreign(lnn_run, tmp_path / "run", change)
-    with pytest.raises(ConfigError, match="unless you add") as error:
-        load_run(run, "best")
-    package = re.search(r"add trust=([\w.]+)", str(error.value))[1]
-    assert load_run(run, "best", (package,)).folder == run
-
-
-def test_runs_of_different_data_are_evaluated_separately_or_on_one_data_set(
-    tmp_path, lnn_run, undrawn
-):
-    other = train(tmp_path / "other", "model=mlp", "dataset.seed=5", NO_FIGURES)
-    words = [f"runs=[{lnn_run},{other}]", "horizon=0.1", "windows=[]"]
-    message = str(fails("evaluate.py", *words, f"hydra.run.dir={tmp_path / '0'}").code)
-    assert f"{other} has another data set" in message
-    assert "evaluate them separately, or all on one data set, dataset=<name>" in message
-    for k, run in enumerate((lnn_run, other), 1):
-        words[0] = f"runs=[{run}]"
-        run_script("evaluate.py", *words, f"hydra.run.dir={tmp_path / str(k)}")
-    words[0] = f"runs=[{lnn_run},{other}]"
-    run_script(
-        "evaluate.py", *words, "dataset=soft_arm_1", *TINY_DATA, f"hydra.run.dir={tmp_path / '3'}"
-    )
-    assert len(pd.read_csv(tmp_path / "3" / "summary.csv")) >= 2
 
 
 def test_an_ensemble_has_the_interval_that_a_single_network_has_not(lnn_run, run_of):

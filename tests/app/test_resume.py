@@ -6,7 +6,6 @@ import shutil
 import signal
 import time
 from functools import partial
-from pickle import UnpicklingError
 
 import lightning as L
 import pytest
@@ -17,7 +16,6 @@ import pinn_dyn
 from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.training import WholeCheckpoints
 from tests.app.entry import (
     NO_FIGURES,
     TINY,
@@ -216,16 +214,6 @@ def test_a_damaged_last_checkpoint_is_replaced_by_the_best_one(command, capsys, 
     assert [event.step for event in events] == list(range(step + 4, 30, 5))
 
 
-def test_lightning_reads_no_code_from_a_checkpoint(command, monkeypatch):
-    """Behind the check of the checkpoint, which is replaced here."""
-    change(command, payload=Marker("was_here"))
-    good = checkpoint(command, "best")
-    monkeypatch.setattr("pinn_dyn.run.run_folder.read_checkpoint", lambda path: good)
-    with pytest.raises(UnpicklingError, match="Weights only load failed"):
-        run_script("train.py", f"resume={command}")
-    assert not os.path.exists("was_here")
-
-
 def test_a_resumed_training_writes_to_its_own_folder(command, tmp_path):
     """Whatever the configuration in the checkpoint says about places and names."""
     saved = checkpoint(command)
@@ -263,25 +251,3 @@ def test_resume_refuses_changed_data(command, capsys):
 
 
 # Writing.
-
-
-def test_a_checkpoint_is_replaced_only_by_a_whole_one(tmp_path, monkeypatch):
-    path = tmp_path / "last.ckpt"
-    writer = WholeCheckpoints()
-    writer.save_checkpoint({"step": 1}, path)
-    before = path.stat().st_ino
-    with path.open("rb") as open_before:
-        writer.save_checkpoint({"step": 2}, path)
-        # A reader of the old file still reads it whole: the new one is another file.
-        assert torch.load(open_before, weights_only=True) == {"step": 1}
-    assert path.stat().st_ino != before
-
-    def fails_midway(checkpoint, file):
-        file.write(b"half of it")
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(torch, "save", fails_midway)
-    with pytest.raises(OSError, match="No space left"):
-        writer.save_checkpoint({"step": 3}, path)
-    assert torch.load(path, weights_only=True) == {"step": 2}
-    assert list(tmp_path.iterdir()) == [path]

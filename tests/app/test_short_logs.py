@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 import pinn_dyn
-from pinn_dyn.data import DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import KnownMechanics
 from pinn_dyn.systems import RigidChain
@@ -91,29 +90,3 @@ def test_a_fit_refuses_what_no_trainer_has_and_names_what_it_does_not_use(caplog
     fit(trainer={"accelerator": "cpu", "gradient_clip_val": 1.0, "precision": "bf16-mixed"})
     text = "least squares does not use"
     assert [x for x in caplog.messages if text in x] == [f"{text} trainer.precision"]
-
-
-def test_all_windows_are_used_if_there_are_fewer_than_pairs(short_source):
-    data = DynamicsData(
-        short_source, pairs=150, steps=10, stride=1, batch_size=150, batches_per_epoch=1, seed=0
-    )
-    starts = sum(len(x.t) - 10 for x in data.splits.train)
-    assert len(data.windows) == starts < 150
-    assert data.batch_size == starts
-
-
-@pytest.fixture
-def short_source(tmp_path):
-    short_log(2, 50).to_csv(tmp_path / "log.csv", index=False)
-    part = {"seconds": 0.3, "piece": 0.3}
-    return pinn_dyn.LogSource(
-        name="rod",
-        root=str(tmp_path),
-        files="log.csv",
-        time=dict(columns="t", unit="s"),
-        q=dict(columns=["q"], unit="rad"),
-        v=dict(columns=["v"], unit="rad/s"),
-        u=dict(columns=["tau"], unit="Nm"),
-        validation=part,
-        test=part,
-    )

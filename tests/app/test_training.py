@@ -109,28 +109,6 @@ def test_runs_go_to_a_folder_named_by_data_set_model_and_seed(tmp_path, monkeypa
     assert_trained(folder)
 
 
-def test_a_sweep_writes_a_folder_per_combination(tmp_path):
-    run_script(
-        "train.py",
-        "-m",
-        *TINY,
-        NO_FIGURES,
-        "model=lnn,hnn",
-        "seed=0,1",
-        f"hydra.sweep.dir={tmp_path / 'sweep'}",
-    )
-    found = set()
-    for path in (tmp_path / "sweep").glob("*/config.yaml"):
-        config = yaml.safe_load(path.read_text())
-        record = json.loads((path.parent / "metrics.json").read_text())
-        saved = load(path.parent)["hyper_parameters"]["config"]
-        assert record["seed"] == config["seed"] == saved["seed"]
-        assert config["model"]["_target_"] == saved["model"]["_target_"]
-        found.add((config["model_name"], config["seed"]))
-    assert found == {(model, seed) for model in ("lnn", "hnn") for seed in (0, 1)}
-    assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 4
-
-
 def test_a_step_too_long_for_the_fastest_motion_is_named(tmp_path, capsys):
     words = ["dataset.step=0.05", "data.stride=1", NO_FIGURES, f"hydra.run.dir={tmp_path}"]
     run_script("train.py", *TINY, *words)

@@ -37,29 +37,15 @@ ROBOTS = {
         v=columns(numbered("qd", 7), "rad/s"),
         u=columns(numbered("tau", 7), "Nm"),
     ),
-    "ur10e": dict(
-        root="ur10e",
-        q=columns(numbered("q", 6), "rad"),
-        v=columns(numbered("qd", 6), "rad/s"),
-        u=columns(numbered("i", 6), "A"),
-    ),
     "trunk": dict(
         root="asl_trunk",
         q=columns(["x2", "z2", "x3", "z3"], "m"),
         u=columns(numbered("phi", 6), "deg"),
     ),
-    "neck": dict(
-        root="humasoft_soft_arm",
-        files="rand_0-1.csv",
-        trajectory="traj",
-        q=columns(["pitch", "yaw"], "rad"),
-        u=columns(numbered("m", 3), "rad"),
-    ),
 }
 STRUCTURES = {
     "pendulum": ROOT / "examples" / "double_pendulum.urdf",
     "axis": ROOT / "examples" / "emps.urdf",
-    "ur10e": LOGS / "ur10e" / "ur10e.urdf",
 }
 
 

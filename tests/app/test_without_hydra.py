@@ -51,25 +51,6 @@ def test_constants_are_fitted_and_loaded_without_hydra_and_lightning(tmp_path):
     assert list((tmp_path / "run" / "tensorboard").glob("events*"))
 
 
-def test_what_is_blocked_cannot_be_imported(tmp_path):
-    process = run(tmp_path / "run", "network", ["lightning"])
-    assert "ModuleNotFoundError: import of lightning halted" in process.stderr
-
-
-def test_a_run_is_read_without_the_imports_of_its_callbacks():
-    code = """
-import sys
-sys.modules.update(hydra=None, lightning=None, matplotlib=None)
-import pinn_dyn.run.run_folder
-from pinn_dyn.run.configuration.trust import may_build
-assert may_build("pinn_dyn.evaluation.RolloutFigures", ())
-assert not may_build("pinn_dyn.evaluation.save", ()), "no class"
-assert not may_build("pinn_dyn.evaluation.Path", ()), "not public"
-"""
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
-    assert process.returncode == 0, process.stderr
-
-
 def test_a_log_is_checked_without_the_imports_of_its_page():
     code = """
 import sys

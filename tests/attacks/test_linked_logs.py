@@ -50,10 +50,3 @@ def test_values_of_other_files_are_refused(tmp_path, linked, suffix):
     columns["u"] = dict(columns=[f"log{dot}far"], unit="Nm")
     with pytest.raises(LogError, match="log/far: values of other files"):
         source(tmp_path, files=path.name, **columns).load()
-
-
-def test_values_of_other_files_that_are_not_needed_are_not_opened(tmp_path, linked):
-    log_formats.write_hdf5(tmp_path / "run.h5", motion(5.0))
-    linked(tmp_path / "run.h5")
-    (tmp_path / "secret" / "file.h5").unlink()
-    assert source(tmp_path, files="run.h5", **named("log/{}_{}", "log/t")).load().train

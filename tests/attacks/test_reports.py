@@ -23,7 +23,6 @@ SCRIPTS = [
     "<img src=x onerror=alert(1)>",
     "' onmouseover='alert(1)",
     '" onmouseover="alert(1)',
-    "{{ 7 * 7 }}{% raw %}",
     "<!--",
 ]
 LINKS = [
@@ -34,9 +33,7 @@ LINKS = [
     "![x](https://localhost/x.png)",
     "[x][1]\n\n[1]: javascript:alert(1)",
     "[x]\n\n[x]: javascript:alert(1)",
-    "![x][1]\n\n[1]: https://localhost/x.png",
     "<javascript:alert(1)>",
-    "<somebody@localhost>",
     "| a |\n|---|\n| [x](javascript:alert(1)) |",
 ]
 

@@ -13,40 +13,28 @@ from tests.support.composing import REQUIRED, compose
 # What the generated values below do not try: limits, keys of the program, code, values in lists.
 MISTAKES = {
     "train": """
-        dataset._target_=os.system
         optimizer._target_=builtins.dict
         scheduler._target_=torch.optim.SGD
         model.integrator._partial_=true
-        model.integrator._partial_=3
-        model.inverse_mass._partial_=false
         dataset.excitation.parts=[3]
-        dataset.labels=[1,2,3]
         dataset.system.segments=0
         dataset.rtol=-1
         data.pairs=1.5
         data.steps=0
         data.coverage=2
-        data.batches_per_epoch=3
         model.angles=[a]
         model.inverse_mass.hidden=[8,x]
-        model.inverse_mass.hidden=[0]
         loss.huber=nan
         loss.curriculum=fast
         optimizer.lr=0
         optimizer.weight_decay=-1
-        optimizer.eps=-1
-        optimizer.maximize=true
         scheduler.warm_up=2
-        scheduler.total_steps=3
         validator.horizon=0
         callbacks.more={_target_: pinn_dyn.data.Chirp}
         trainer.steps=0
-        trainer.max_epochs=3
         trainer.precision=16-mixed
         trainer.devices=0
         seed=-1
-        seed=1.5
-        seed=true
         compile=1
         resume=[a]
         trust=1
@@ -54,37 +42,29 @@ MISTAKES = {
     "evaluate": """
         runs=[[a]]
         dataset={_target_: os.getcwd}
-        checkpoint=first
         split=train
         step=0
-        windows=[null]
         windows=[0]
         thresholds={a: {b: 1}}
         thresholds.small=0
-        trajectory=-1
     """,
     "control": """
         gains.velocity=-1
-        gains.position=true
         reference.q=[[0.1], [x]]
         controllers.more={terms: learned}
         controllers.learned.terms=both
-        controllers.learned.observer={}
         plant={_target_: pinn_dyn.control.Regulation, _partial_: true}
         plant={_target_: pinn_dyn.control.SystemPlant, _partial_: true, rtol: -1}
         plant={_target_: pinn_dyn.control.SystemPlant, _partial_: true, system: 3}
         guard.threshold=-1
-        guard.fallback=stop
         duration=0
         actuator.low=x
-        actuator.lowest=1
         dead_time=-1
     """,
     "gather": "evaluations=[1]",
     "excite": """
         duration=0
         limits.share=1.5
-        limits.low=[x]
         approach=-1
         start={a: x}
     """,

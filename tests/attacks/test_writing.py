@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pinn_dyn.run.configuration.validation import ConfigError
-from tests.app.entry import NO_FIGURES, refused_text, run_script, train
+from tests.app.entry import refused_text, run_script
 from tests.support.foreign_runs import foreign
 
 LOGGERS = "lightning.pytorch.loggers"
@@ -49,19 +49,11 @@ def test_links_above_and_inside_a_run_folder_are_no_obstacle(tmp_path, lnn_run):
     assert torch.load(run / "checkpoints" / "best.ckpt", weights_only=True)["finished"]
 
 
-def test_a_training_may_begin_in_a_folder_with_links(tmp_path):
-    (tmp_path / "bin").symlink_to("/usr/bin")
-    train(tmp_path, "model=lnn", NO_FIGURES)
-    train(tmp_path, "model=lnn", NO_FIGURES)
-
-
 @pytest.mark.parametrize(
     ("section", "part"),
     [
         ("logger", CSV | {"version": "../.."}),
-        ("logger", CSV | {"name": "/tmp/out"}),
         ("logger", BOARD | {"filename_suffix": "/../../out"}),
-        ("callbacks", KEEPER | {"filename": "/tmp/out"}),
         ("callbacks", KEEPER | {"filename": "{epoch}/../../out"}),
     ],
 )

@@ -92,8 +92,6 @@ def predictive(model):
 @pytest.mark.parametrize(
     ("make", "delays"),
     [
-        (tracking, (0.015, 0.015)),
-        (tracking, (0.03, 0.03)),
         (tracking, (0.03, 0.013)),
         (observed, (0.03, 0.013)),
         (predictive, (0.03, 0.013)),

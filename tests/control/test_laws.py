@@ -14,11 +14,10 @@ from pinn_dyn.control.laws import (
     Tracking,
     condition_number,
 )
-from pinn_dyn.mechanics.arrays import pseudo_inverse_times
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
-from pinn_dyn.testing.controller import input_of, row, states
-from tests.models.builders import make_model, make_structured
+from pinn_dyn.testing.controller import input_of, states
+from tests.models.builders import make_structured
 from tests.support.cart_pole import CartPole
 from tests.support.contracts import one_case
 from tests.support.linear import double
@@ -52,15 +51,6 @@ def test_regulation_of_a_linear_system_is_the_formula(n, m):
     assert_near(u, torch.tensor(np.array(expected)), 1e-12)
 
 
-def test_proportional_derivative_is_the_feedback_through_the_input_matrix():
-    q, v, motion = states(2)
-    system = linear_system(2, 3)
-    u = input_of(ProportionalDerivative(system, 3.0, 2.0), q, v, motion)
-    feedback = 3.0 * (motion.q - q) + 2.0 * (motion.v - v)
-    expected = feedback.numpy() @ system.inputs.detach().numpy()
-    assert_near(u, torch.from_numpy(expected), 1e-12)
-
-
 @pytest.mark.parametrize("law", [Regulation, Tracking, ComputedTorque])
 def test_laws_on_the_cart_pole_are_their_formulas(law):
     """By its terms, written by hand; the one input reaches the first coordinate."""
@@ -78,18 +68,6 @@ def test_laws_on_the_cart_pole_are_their_formulas(law):
     expected = force if law is ComputedTorque else force + pd[:, 0]
     u = input_of(law(CartPole(), [3.0, 5.0], [1.0, 2.0]), q, v, motion)
     assert_near(u[:, 0], expected, 1e-12)
-
-
-@pytest.mark.parametrize(
-    ("n", "m", "batch"), [(1, 1, (1,)), (2, 2, ()), (2, 2, (2,)), (1, 3, (2, 3)), (3, 1, (2,))]
-)
-def test_one_force_serves_a_batch_of_any_shape(n, m, batch):
-    generator = torch.Generator().manual_seed(0)
-    A = torch.randn(*batch, n, m, generator=generator, dtype=torch.float64)
-    tau = torch.arange(1.0, n + 1, dtype=torch.float64)
-    expected = [np.linalg.pinv(a) @ tau.numpy() for a in A.reshape(-1, n, m).numpy()]
-    u = pseudo_inverse_times(A, tau)
-    assert_near(u, torch.tensor(np.array(expected)).reshape(*batch, m), 1e-9)
 
 
 # The closed loop that the laws promise.
@@ -177,29 +155,7 @@ def test_the_condition_number_is_the_ratio_of_singular_values_up_to_the_rank():
 # Deployment.
 
 
-@pytest.mark.parametrize(
-    ("law", "kind", "num_inputs"),
-    [(Tracking, "lnn", 2), (ComputedTorque, "lnn", 2), (Regulation, "hnn", 1)],
-)
-def test_the_formula_can_be_exported(law, kind, num_inputs):
-    """That of PD is a part of all the others."""
-    controller = law(make_model(kind, 2, num_inputs).requires_grad_(False), 5.0, 1.0)
-    q, v, motion = states(2)
-
-    pipeline, memory = Pipeline(controller), torch.zeros(1 + num_inputs).double()
-    exported = torch.export.export(pipeline, (q[0], v[0], *row(motion, 0), memory)).module()
-    other = states(2, seed=6)
-    u, _, _ = exported(other[0][0], other[1][0], *row(other[2], 0), memory)
-    assert_near(u, input_of(controller, *other)[0], 1e-12)
-
-
 # Errors.
-
-
-@pytest.mark.parametrize("kind", ["next_state", "acceleration"])
-def test_a_black_box_has_no_terms_for_a_law(kind):
-    with pytest.raises(TypeError, match=r"MLP, expected .* terms M, G and A, such as model=lnn"):
-        Tracking(make_model(kind), 1.0, 1.0)
 
 
 # The contract.

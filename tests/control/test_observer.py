@@ -15,7 +15,6 @@ from pinn_dyn.control.references import SetPoint, Sines
 from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
 from pinn_dyn.testing.controller import input_of, states
 from tests.support.cart_pole import CartPole
-from tests.support.closed_loops import PD
 from tests.support.linear import double
 
 ZERO = np.zeros((2, 2))
@@ -213,8 +212,3 @@ class TestOnTheCartPole(ControllerContract):
     def controller(self):
         law = Tracking(CartPole(), 5.0, 1.0)
         return DisturbanceObserver(law, 50.0, max_rate=30.0)
-
-
-def test_a_law_without_a_mechanical_system_has_no_observer():
-    with pytest.raises(TypeError, match="needs a model with terms M, G and A, and PD has none"):
-        DisturbanceObserver(PD(), 20.0)

@@ -41,7 +41,7 @@ def test_soft_arm_moves_as_scipy_says_at_a_tight_tolerance():
             np.testing.assert_allclose(states[k, i], x, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("duration", [0.001, 0.1, 0.5])
+@pytest.mark.parametrize("duration", [0.001, 0.5])
 def test_linear_system_moves_as_its_matrix_exponential(duration):
     system = damped_oscillators()
     q0, v0 = double([[0.5, -0.2], [1.0, 2.0]]), double([[0.0, 1.0], [-1.0, 0.3]])

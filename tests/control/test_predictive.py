@@ -112,26 +112,6 @@ def test_limits_hold_on_both_sides_and_at_a_rate_above_that_of_the_plan():
     assert -0.81 < record.q.min() < -0.79
 
 
-class Rough(Pendulums):
-    """A pendulum with smooth Coulomb friction."""
-
-    def friction_force(self, v):
-        return 0.8 * torch.tanh(v / 0.04)
-
-
-def test_a_set_point_beyond_a_limit_is_approached_up_to_the_limit(caplog):
-    """Plans that weigh the goal against the limit fail, and leave the limit."""
-    settings = {"velocity_weight": 0.01, "q_high": 0.3, "actuator": Actuator(-6.0, 6.0)}
-    law = PredictiveControl(pendulum(kind=Rough), 0.8, STEP, **settings)
-    start = double([[0.0]]), double([[0.0]])
-    record = close_loop(
-        SystemPlant(pendulum(kind=Rough)), law, SetPoint([1.0]), *start, duration=1.0, rate=1 / STEP
-    )
-    assert not record.diagnostics["solver_failed"].any()
-    assert 0.29 < record.q[0, -1] <= record.q.max() < 0.301
-    assert not caplog.text
-
-
 def test_a_new_run_forgets_the_previous_run(law):
     first, second = run(law, duration=0.5), run(law, duration=0.5)
     torch.testing.assert_close(first.u, second.u, rtol=0, atol=0)
@@ -189,8 +169,7 @@ def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
     assert "leaves the limits of q[0]" in caplog.text
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize(("bad", "k"), [(np.nan, 0), (-np.inf, 1)])
 def test_a_state_that_is_not_finite_holds_the_last_input(bad, k):
     law = PredictiveControl(pendulum(), 0.6, STEP, observer_bandwidth=5.0)
     pipeline, goal = Pipeline(law, STEP), SetPoint([1.0])(0.0)
@@ -217,10 +196,3 @@ def test_limits_and_references_that_are_not_numbers_are_named():
             PredictiveControl(pendulum(), 0.6, STEP, **{name: np.nan})
     with pytest.raises(ValueError, match="low nan and high None, expected low <= high"):
         Actuator(low=np.nan)
-
-
-def test_values_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match="v_max is"):
-        PredictiveControl(pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
-    with pytest.raises(ValueError, match="expected at least two steps"):
-        PredictiveControl(pendulum(), 0.05, STEP)

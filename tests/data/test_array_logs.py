@@ -10,7 +10,7 @@ import torch
 
 from pinn_dyn.data.logs import LogError
 from tests.data import log_formats as formats
-from tests.data.logs_files import arrays_of, assert_read, motion, named, source
+from tests.data.logs_files import arrays_of, motion, named, source
 
 TABLE = motion(6.0)
 HDF5 = dict(files="*.h5", **named("log/{}_{}", "log/t"))
@@ -28,8 +28,6 @@ def write_lerobot(folder, names):
     [
         ["main_shoulder_pan", "elbow.pos"],
         {"motors": ["main_shoulder_pan", "elbow.pos"]},
-        {"axes": [["main_shoulder_pan"], ["elbow.pos"]]},
-        {"main_shoulder_pan": 0, "elbow.pos": 1},
     ],
 )
 def test_lerobot_entries_have_the_names_of_the_data_set(tmp_path, names):
@@ -89,14 +87,11 @@ def test_a_star_stands_for_the_run_in_names_without_groups(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "form"),
     [
-        ("npz", stacked),
         ("npz", numbered),
         ("h5", shared_clock),
         ("h5", time_first),
-        ("mat", time_first),
         ("mat", numbered),
         ("pt", stacked),
-        ("pt", shared_clock),
     ],
 )
 def test_arrays_of_several_runs(tmp_path, kind, form):
@@ -122,23 +117,3 @@ def test_arrays_of_several_runs(tmp_path, kind, form):
         for name in "qvu":
             expected = table[[f"{name}1", f"{name}2"]].to_numpy()[: len(run)]
             np.testing.assert_allclose(getattr(run, name), expected)
-
-
-def test_the_rate_in_an_hdf5_file_without_clock_is_named(tmp_path):
-    formats.write_hdf5(tmp_path / "run.h5", TABLE)
-    with h5py.File(tmp_path / "run.h5", "a") as file:
-        del file["log/t"]
-        file["log"].attrs["fps"] = 100
-    with pytest.raises(LogError, match=r"write time=\{'rate': 100\}.*log/q \(601, 2\).*log@fps"):
-        source(tmp_path, **HDF5).load()
-    assert_read(source(tmp_path, **HDF5 | {"time": {"rate": 100}}), TABLE)
-
-
-def test_json_holds_runs(tmp_path):
-    tables = [motion(phase=0.5 * k) for k in range(2)]
-    (tmp_path / "log.json").write_text(json.dumps([formats.json_arrays(x) for x in tables]))
-    log = source(tmp_path, files="log.json", **formats.NESTED)
-    assert {part.raw.run for part in log.cleaned} == {"0", "1"}
-    for part in log.cleaned:
-        rows = np.round(100 * part.raw.t).astype(int)
-        np.testing.assert_allclose(part.raw.q, arrays_of(tables[int(part.raw.run)])["q"][rows])

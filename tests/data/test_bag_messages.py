@@ -95,14 +95,6 @@ def test_messages_without_a_stamp_have_their_time_of_receipt(tmp_path):
     assert table.notes == ["3 of 301 messages of /joint_states with stamp 0 are dropped"]
 
 
-def test_a_simulation_starts_at_0_without_a_note(tmp_path):
-    items = [(t, joint_state(k, stamp=round(1e9 * t))) for k, t in enumerate(T[:, 0])]
-    write(tmp_path / "bag", items)
-    table = read(tmp_path / "bag")
-    assert_motion(table, shift=-1e-9 * START)
-    assert not table.notes
-
-
 @pytest.mark.parametrize(("first", "slower"), [(10**9, 2.0), (START + 5 * 10**9, 1.0)])
 def test_commands_without_stamps_are_put_on_the_clock_of_the_states(tmp_path, first, slower):
     """Also beside a simulation that runs at half speed."""
@@ -123,13 +115,6 @@ def test_commands_without_stamps_are_put_on_the_clock_of_the_states(tmp_path, fi
     table.frame[f"{STATES}/t"] += 1e-9 * (START - first)
     assert_motion(table)
     assert table.notes == ["times of receipt put /commands on the clock of /joint_states"]
-
-
-def test_names_of_joints_may_contain_a_slash(tmp_path):
-    joints = ["arm/j1", "arm/j2"]
-    write(tmp_path / "bag", states(names=joints))
-    columns = [f"{STATES}/{x}/{joint}" for x in ("position", "effort") for joint in joints]
-    assert_motion(read(tmp_path / "bag", columns))
 
 
 def test_a_gripper_on_the_topic_of_the_arm_is_named(tmp_path):
@@ -188,20 +173,10 @@ def test_two_publishers_that_the_bag_does_not_tell_apart_are_named(tmp_path):
         read(tmp_path / "bag")
 
 
-def test_messages_that_come_late_are_sorted(tmp_path):
-    items = states()
-    items[5:8] = [(t, m) for (t, _), (_, m) in zip(items[5:8], items[5:8][::-1], strict=True)]
-    write(tmp_path / "bag", items)
-    table = read(tmp_path / "bag")
-    assert_motion(table)
-    assert (np.diff(table.frame.iloc[:, 0]) > 0).all()
-
-
 @pytest.mark.parametrize(
     ("plugin", "mode"),
     [
         (StoragePlugin.MCAP, CompressionMode.FILE),
-        (StoragePlugin.SQLITE3, CompressionMode.FILE),
         (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
     ],
 )

@@ -59,7 +59,7 @@ def test_signals_of_several_draws_are_joined():
     np.testing.assert_array_equal(signal(TIME), expected)
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 9])
+@pytest.mark.parametrize("count", [2, 5])
 def test_a_mixture_takes_its_parts_in_turn(count):
     """Parts with offsets far apart show which part a signal came from."""
     parts = [MultiSine([10.0 * k], [1.0]) for k in range(3)]
@@ -85,13 +85,6 @@ def test_steps_are_smooth_ramps_between_held_levels():
     assert (slope > 0.5 * AMPLITUDE / rise).all()
     held = (np.abs(np.diff(u, axis=1)) < 1e-12).mean()
     assert 0.6 < held < 0.95
-
-
-def test_steps_go_on_until_the_end_of_the_duration():
-    """Held at most 1 s, a signal has a ramp within any 1.1 s, the last ones included."""
-    u = samples(Steps(OFFSET, AMPLITUDE, hold=[0.3, 1.0], rise_time=0.1), count=40)
-    tail = u[:, TIME >= DURATION - 1.1]
-    assert (np.ptp(tail, axis=1) > 0).all()
 
 
 def test_a_chirp_sweeps_from_one_end_of_its_band_to_the_other():

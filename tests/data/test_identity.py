@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data import DataSource, Splits, StoredSource, data_changes, data_identity, store
-from pinn_dyn.data.cache import describe
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.systems import SoftArm
 
 # Identity.
 
@@ -100,8 +98,3 @@ def test_stored_data_have_the_identity_of_their_source(tmp_path):
 
 
 # Description of a simulation.
-
-
-def test_our_own_robots_are_described_by_their_settings():
-    assert describe(SoftArm()) == describe(SoftArm().eval()) != describe(SoftArm(mass=[0.31]))
-    assert describe(SoftArm())["class"] == "SoftArm"

@@ -64,10 +64,6 @@ def runs(text):
     return {part: {"runs": x, "piece": 0.5} for part, x in (("test", both), ("validation", ["d"]))}
 
 
-def parts(names):
-    return {name: table()[["t", name[-1] if "_" in name else "qu"[k % 2]]] for k, name in names}
-
-
 ALTERNATING = table()
 ALTERNATING.loc[1::2, "q"] -= 2 * ALTERNATING.loc[1::2, "q"]
 SLOW = {"a": table(), "b": table(), "c": table()[::2].reset_index(drop=True)}
@@ -103,16 +99,8 @@ ADVICE = {
         COPIED, SPLIT, r"motions of (\w repeat one of \w), .* keep such runs in one split",
         lambda text: (COPIED, runs(text)),
     ),
-    "pieces too long": (
-        table(), {"test": {"seconds": 1.0, "piece": 1.5}}, r"lower (\w+) or",
-        lambda key: (table(), {"test": {"seconds": 1.0, key: 0.5}}),
-    ),
     "joint twice": (
         LONG, OF_LONG, r"same time: drop the (row)", lambda _: (LONG.iloc[:-1], OF_LONG),
-    ),
-    "parts without names": (
-        parts(enumerate("abcd")), {}, r"name them as (.*)",
-        lambda names: (parts(enumerate(names.split(", "))), {}),
     ),
     "derived and measured v": (
         changed(w=np.gradient(table()["q"], 0.01)), MEASURED, r"leave out (\w+), or v",

@@ -12,9 +12,8 @@ import pytest
 import yaml
 from hydra.utils import instantiate
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
 
-from pinn_dyn.data.logs import READERS, LogError, LogSource, Request, Resample
+from pinn_dyn.data.logs import LogError, LogSource, Request, Resample
 from pinn_dyn.data.logs.columns import to_si
 from pinn_dyn.data.logs.readers.bags import read_bag
 from tests.data import log_formats as formats
@@ -53,29 +52,6 @@ def test_a_bag_is_decoded_once_until_it_changes(tmp_path, monkeypatch):
     shutil.rmtree(tmp_path / "run")
     formats.write_bag(tmp_path / "run", TABLE[:300])
     assert len(read_bag(tmp_path / "run", QUERY)) == 2 * 300
-
-
-def test_an_entry_of_nested_messages(tmp_path):
-    """Points of a trajectory: numbers of an element of a sequence, by a joint's name."""
-    types = formats.STORE.types
-    kind = "trajectory_msgs/msg/JointTrajectory"
-    point = types["trajectory_msgs/msg/JointTrajectoryPoint"]
-    stamp = types["builtin_interfaces/msg/Time"](sec=3, nanosec=5)
-    lasting = types["builtin_interfaces/msg/Duration"](sec=0, nanosec=7)
-    none = np.array([])
-    numbers = [np.array([k + 0.25, k + 0.5]) for k in range(2)]
-    message = types[kind](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="base"),
-        joint_names=["a", "elbow"],
-        points=[point(x, none, none, 10 * x, lasting) for x in numbers],
-    )
-    with Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/plan", kind, typestore=formats.STORE)
-        writer.write(connection, 1, formats.STORE.serialize_cdr(message, kind))
-    columns = ["/plan/points/1/positions/elbow", "/plan/points/1/effort/0"]
-    columns.append("/plan/points/0/time_from_start/nanosec")
-    frame = read_bag(tmp_path / "run", Request("/plan/t", columns)).frame
-    assert frame.loc[1].tolist() == [pytest.approx(3.000000005), 1.5, 12.5, 7]
 
 
 def test_of_another_clock_inputs_are_the_last_and_velocities_are_interpolated(tmp_path):
@@ -146,15 +122,6 @@ def test_lerobot_files_have_vectors_and_episodes_also_without_their_column(tmp_p
     log = source(tmp_path, **{**formats.LEROBOT, "trajectory": None})
     assert len({part.raw.run for part in log.cleaned}) == 3
     assert "the time goes back to 0 s: a run is assumed to start there (2 such rows)" in log.report
-
-
-def test_a_format_is_one_function(tmp_path, monkeypatch):
-    monkeypatch.setitem(READERS, ".pkl", lambda path, request: pd.read_pickle(path))
-    TABLE.to_pickle(tmp_path / "run.pkl")
-    assert_read(source(tmp_path, files="*.pkl"), TABLE)
-    (tmp_path / "run.foo").touch()
-    with pytest.raises(LogError, match=r"no reader for '\.foo': save the log as one of \.csv"):
-        source(tmp_path, files="*.foo").load()
 
 
 PAGE = (Path(__file__).parents[2] / "docs" / "bags_and_other_logs.md").read_text()

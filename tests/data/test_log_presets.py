@@ -1,9 +1,6 @@
 """The presets: four recorded data sets where they are at hand, and the templates."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +10,6 @@ from pinn_dyn.app.config import composed
 from pinn_dyn.data import draw_windows, logs
 from pinn_dyn.mechanics import stack
 from pinn_dyn.run.configuration.build import build_source
-from pinn_dyn.run.configuration.trust import may_build
 from tests.data.logs_files import motion, write
 from tests.support.recorded_logs import LOGS, needs_logs
 
@@ -58,25 +54,6 @@ def test_recorded_data_sets(name, train, validation, test, step, coordinates, in
     assert "## Warnings\n\n- none" in source.report
 
 
-def test_template_in_ten_lines(tmp_path):
-    write(tmp_path, motion())
-    source = preset(
-        "csv_log",
-        f"dataset.root='{tmp_path}'",
-        "dataset.files=run.csv",
-        "dataset.q.columns=[q1,q2]",
-        "dataset.q.unit=rad",
-        "++dataset.u.columns=[u1,u2]",
-        "++dataset.u.unit=Nm",
-        "++dataset.validation.seconds=1.0",
-        "++dataset.validation.piece=1.0",
-        "++dataset.test.seconds=2.0",
-        "++dataset.test.piece=1.0",
-    )
-    splits = source.load()
-    assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [1, 1, 2]
-
-
 def test_neck_with_its_moving_average(tmp_path):
     table = motion(300.0, rate=10.0)
     write(tmp_path, table.assign(u3=-table["u1"], u4=-table["u2"]), "neck.csv")
@@ -86,16 +63,6 @@ def test_neck_with_its_moving_average(tmp_path):
     assert splits.test[0].t[-1] == pytest.approx(5.0)
     assert splits.train[0].u.shape[1] == 4
     assert "mean of 50 samples (5 s) of q, v, u" in source.report
-
-
-def test_the_code_of_the_documentation_runs():
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "csv_logs.md").read_text(), re.S)
-    names: dict = {}
-    for block in blocks:
-        exec(block, names)
-    assert len(names["splits"].test) == 1
-    assert names["splits"].train[0].q.std() == pytest.approx(0.7, abs=0.1)
-    assert "low-pass of 20 Hz" in names["source"].report
 
 
 def test_the_documentation_names_every_unit_and_step():
@@ -121,23 +88,3 @@ def test_the_sections_that_measurements_link_to_exist():
         headings = re.findall(r"^#+ (.*)$", (ROOT / "docs" / page).read_text(), re.MULTILINE)
         anchors = [re.sub(r"[^\w -]", "", x).lower().replace(" ", "-") for x in headings]
         assert anchor in anchors
-
-
-def test_run_folders_may_name_the_steps_of_the_package_only(tmp_path):
-    """A folder ``examples`` beside a foreign run is neither trusted nor executed."""
-    (tmp_path / "examples").mkdir()
-    (tmp_path / "examples" / "__init__.py").write_text("open('was_here', 'w')")
-    code = "from pinn_dyn.run.configuration.trust import may_build as may; print(may({!r}, ()))"
-    name = "pinn_dyn.data.logs.{}"
-    result = subprocess.run(
-        [sys.executable, "-c", code.format(name.format("SubtractStart"))],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert result.stdout.strip() == "True"
-    assert not (tmp_path / "was_here").exists()
-    assert may_build(name.format("SubtractStart"), ())
-    assert not may_build(name.format("replace"), ())

@@ -63,9 +63,7 @@ FILES = {
     "Motive": (motive(), "arm:tip", "arm", "Time (Seconds)"),
     "Motive 3": (motive(parent=True), "arm:tip", "arm", "Time (Seconds)"),
     "Nexus": (nexus(), "arm:tip", "arm:base", ""),
-    "Nexus, tabs": (nexus("\t"), "arm:tip", "arm:base", ""),
     "QTM": (qtm(), "tip", "base", "Time"),
-    "QTM without names": (qtm(names=False), "tip", "base", "Time"),
     "QTM without frames": (qtm(frames=False, names=False), "tip", "base", ""),
 }
 

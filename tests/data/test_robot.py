@@ -18,15 +18,11 @@ from pinn_dyn.data import (
     RobotSource,
     SimulationError,
     TrackedMultiSine,
-    draw_windows,
 )
 from pinn_dyn.data.cache import load_or_make
 from pinn_dyn.data.robot_excitation import DrawnMotion
-from pinn_dyn.evaluation import predict_trajectories
-from pinn_dyn.mechanics import Signal, Trajectory, stack
 from tests.support.processes import fork
-from tests.support.simulated_arms import SIMULATORS, simulated_by
-from tests.support.urdf_by_hand import SPATIAL
+from tests.support.simulated_arms import SIMULATORS, SPATIAL, simulated_by
 
 TRACKED = {
     "frequency": [0.05, 0.5],
@@ -37,7 +33,6 @@ TRACKED = {
     "torque": 0.9,
     "bandwidth": 10.0,
 }
-TORQUE = {"frequency": [0.1, 1.0], "harmonics": 4, "amplitude": 0.25, "reach": 0.7}
 FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
 SHORT = {"duration": 0.3, "train": 4, "validation": 2, "test": 2}
 
@@ -72,15 +67,6 @@ def everything(splits):
     return [*splits.train, *splits.validation, *splits.test]
 
 
-def test_counts_names_and_samples_are_those_asked_for(source, splits):
-    assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [4, 2, 2]
-    assert source.labels[0] == "q1 [rad]"
-    assert source.input_labels[-1] == "τ7 [Nm]"
-    for item in everything(splits):
-        assert item.q.shape == item.v.shape == item.u.shape == (301, 7)
-        assert float(item.t[1]) == pytest.approx(1e-3)
-
-
 def moved(source, excitation, steps, *seeds):
     """q, v and u of motions of 10 s that the robot follows, ``(K, T, N)`` each."""
     t = np.arange(10001) * 1e-3
@@ -102,19 +88,6 @@ def test_records_satisfy_the_equation_of_motion_with_the_recorded_torque(source,
     a = source.system.forward_dynamics(q[:, :-1], v[:, :-1], u[:, :-1])
     torch.testing.assert_close(v[:, 1:], v[:, :-1] + 1e-3 * a, rtol=0, atol=1e-8)
     torch.testing.assert_close(q[:, 1:], q[:, :-1] + 1e-3 * v[:, 1:], rtol=0, atol=1e-12)
-
-
-def test_velocities_are_those_at_the_time_of_the_configuration(source, splits):
-    """The true equations, rolled out, stay closer to the samples than to the record."""
-    centred = stack(splits.test).until(0.25)
-    q, v, u = (x[:, : len(centred.t)] for x in recorded(source, "test"))
-    torch.testing.assert_close(centred.q, q, rtol=0, atol=0)
-    raw = Trajectory(q, v, Signal(centred.t, u, "hold"))
-    errors = [
-        predict_trajectories(source.system, item, step=0.01).error().max()
-        for item in (centred, raw)
-    ]
-    assert errors[0] < 0.6 * errors[1]
 
 
 def test_position_velocity_and_torque_limits_hold(source, splits):
@@ -147,15 +120,6 @@ def test_a_tight_torque_limit_slows_the_reference_down(source):
     np.testing.assert_array_equal(q[:, 0], q_slow[:, 0])
     assert (np.abs(v_slow[:, 0]) < 0.95 * np.abs(v[:, 0])).all()
     assert (np.abs(u_slow) <= 0.505 * source.system.u_max).all()
-
-
-def test_more_test_motions_change_no_other(source, splits, tmp_path):
-    """To rounding, as the laws of all motions are computed together."""
-    more = build(tmp_path, test=3).load()
-    assert len(more.test) == 3
-    for first, second in zip(everything(splits), everything(more), strict=False):
-        torch.testing.assert_close(first.q, second.q, rtol=0, atol=1e-9)
-        torch.testing.assert_close(first.u, second.u, rtol=0, atol=1e-6)
 
 
 def test_a_second_load_reads_the_cache(cache, splits, monkeypatch):
@@ -192,16 +156,6 @@ def test_what_changes_the_motion_changes_the_key(source, cache):
     for change in changes:
         found = build(cache, configurations=None, **change).describe()
         assert found != source.describe(), change
-
-
-def test_momenta_are_those_of_the_mass_matrix(source, splits):
-    windows = draw_windows(splits.train, count=50, steps=2, stride=5, seed=0)
-    expected = torch.einsum("bij,bj->bi", source.system.mass_matrix(windows.q), windows.v)
-    torch.testing.assert_close(windows.p, expected, rtol=0, atol=1e-12)
-    item = splits.test[0]
-    expected = torch.einsum("bij,bj->bi", source.system.mass_matrix(item.q), item.v)
-    p = item.states("qp")[:, item.q.shape[1] :]
-    torch.testing.assert_close(p, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SIMULATORS)

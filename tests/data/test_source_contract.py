@@ -22,7 +22,7 @@ from pinn_dyn.systems import MujocoArm, SoftArm
 from pinn_dyn.testing import DataSourceContract
 from tests.data.logs_files import motion, source, write
 from tests.support.contracts import one_case
-from tests.support.urdf_by_hand import SPATIAL
+from tests.support.simulated_arms import SPATIAL
 
 
 @one_case

@@ -4,7 +4,6 @@ import shlex
 
 import numpy as np
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from pinn_dyn.run.configuration.build import build_source
@@ -74,22 +73,3 @@ def test_inputs_beyond_the_range_exceed_it(beyond):
     assert u[..., 2].max() > 2.7
     assert u[..., 2].min() >= -1.3 - 1e-9
     assert np.abs(u[..., :2]).max() <= 2.6
-
-
-@pytest.mark.slow
-def test_motions_cover_the_range_and_stay_within_it(tmp_path):
-    source = build("soft_arm_1_wide", "dataset.step=0.005", f"+dataset.cache={tmp_path}")
-    splits = source.load()
-    low, high = torch.tensor(source.q_limits)
-    for name in ("train", "validation", "test"):
-        for x in getattr(splits, name):
-            assert ((x.q >= low) & (x.q <= high)).all()
-            assert x.v.isfinite().all()
-    q = torch.stack([x.q for x in splits.train])
-    length = source.system.length + q[..., 2]
-    assert float(length.min()) < 0.3
-    assert float(length.max()) > 3.7
-    assert float(torch.linalg.vector_norm(q[..., :2], dim=-1).max()) > 2.3
-    # Not in one corner: a tenth of the time is spent short, and a tenth long.
-    assert float(length.quantile(0.1)) < 0.9
-    assert float(length.quantile(0.9)) > 2.8

@@ -196,17 +196,6 @@ def make_data(**changes):
     return DynamicsData(Stored(), **{**arguments, **changes})
 
 
-def test_training_batches_have_the_asked_shapes_in_single_precision():
-    loaded = list(LightningData(make_data()).train_dataloader())
-    assert len(loaded) == 9
-    for batch in loaded:
-        assert batch.q.shape == (16, 2)
-        assert batch.dq.shape == (16, 2, 2)
-        assert batch.u.shape == (16, 7, 1)
-        assert batch.t.shape == (3,)
-        assert {batch.q.dtype, batch.u.dtype, batch.t.dtype} == {torch.float32}
-
-
 def test_batches_are_picked_on_the_device_that_trains():
     """The windows are moved once; a batch is where they are."""
     data = LightningData(make_data())
@@ -274,8 +263,8 @@ def test_a_stride_in_time_is_the_same_at_any_rate():
         make_data(stride="3 samples").windows  # noqa: B018
 
 
-@pytest.mark.parametrize("rate", [40, 500, 1000])
-@pytest.mark.parametrize(("fastest", "step"), [(1.5, 0.1), (3.0, 0.05), (8.0, 0.02)])
+@pytest.mark.parametrize("rate", [40, 1000])
+@pytest.mark.parametrize(("fastest", "step"), [(1.5, 0.1), (8.0, 0.02)])
 def test_an_automatic_stride_is_a_tenth_of_a_period_at_any_rate(rate, fastest, step):
     """In round times: 66.7, 33.3 and 12.5 ms."""
     t = torch.arange(20 * rate, dtype=torch.float64) / rate
@@ -294,8 +283,8 @@ def automatic_step(q, u, step):
     return data.step
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.003, 0.01, 0.03])
-@pytest.mark.parametrize("hold", [1, 5, 8])
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+@pytest.mark.parametrize("hold", [1, 8])
 @pytest.mark.parametrize(("fastest", "step"), [(1.5, 0.1), (3.0, 0.05)])
 def test_an_automatic_stride_ignores_noise_and_held_inputs(fastest, step, hold, noise):
     rng, t = np.random.default_rng(0), np.arange(6000) / 100
@@ -343,9 +332,3 @@ def test_coverage_counts_the_coordinates():
     )
     for value in windows.q.T.numpy():
         assert kstest(value, "uniform", args=(-1, 2)).statistic < 0.06
-
-
-def test_coverage_of_a_robot_at_rest_draws_what_is_there():
-    still = make_trajectory(0)
-    still = dataclasses.replace(still, q=torch.zeros_like(still.q))
-    assert len(draw([still], coverage=1.0)) == 30

@@ -31,24 +31,6 @@ def test_a_wrong_model_has_a_larger_error_than_the_truth(tmp_path):
         np.testing.assert_array_equal(record["u"], result.records["truth"].u)
 
 
-class HeldArm(SoftArm):
-    """A soft arm whose own simulator does not move it."""
-
-    def set_state(self, q, v):
-        self.state = q, v
-
-    def step(self, torque, step):
-        return self.state
-
-
-def test_a_robot_with_a_simulator_is_moved_by_it():
-    laws = {"law": Regulation(SoftArm(), 20.0, 4.0)}
-    settings = {"duration": 0.02, "rate": 200.0, "q0": REST, "v0": REST}
-    record = close_loops(laws, TARGET, HeldArm(), **settings).records["law"]
-    assert not record.q.any()
-    assert record.u.any()
-
-
 def test_limits_and_initial_states_reach_the_loop():
     laws = {"law": Regulation(SoftArm(), 20.0, 4.0)}
     settings = {"duration": 0.1, "rate": 200.0, "q0": REST, "v0": REST, "settled_after": 0.05}

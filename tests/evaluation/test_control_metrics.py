@@ -138,21 +138,6 @@ def test_overshoot_of_second_order_responses(sign):
     assert found.coordinates["coordinate"].tolist() == ["q1", "q2", "q3"]
 
 
-def test_a_coordinate_that_hardly_steps_has_no_overshoot():
-    t = clock(1.0, 0.01)
-    goal = double([1.0, 0.04])
-    q = torch.stack([1 + 0 * t, 0.5 + 0 * t], -1)[None]
-    q[:, 0] = 0
-    found = closed_loop_metrics(make_record(t, q, goal))
-    assert (
-        found.coordinates["overshoot_worst_percent"].tolist()[0]
-        == found.summary["overshoot_worst_percent"]
-        == found.summary["overshoot_mean_percent"]
-        == 0
-    )
-    assert math.isnan(found.coordinates["overshoot_worst_percent"].tolist()[1])
-
-
 def test_effort_of_an_input_computed_by_hand():
     t = double([0.0, 1.0, 3.0, 4.0])
     u = double([[[1.0, 0.0], [-2.0, 0.0], [4.0, 3.0], [99.0, 99.0]]])  # the last is not obeyed
@@ -167,7 +152,7 @@ def test_effort_of_an_input_computed_by_hand():
 
 @pytest.mark.parametrize(
     ("low", "high", "count"),
-    [(None, 4.0, 1), (-2.0, None, 1), (-2.0, [4.0, 0.0], 3), (double([-9, -9]), 9.0, 0)],
+    [(None, 4.0, 1), (-2.0, [4.0, 0.0], 3), (double([-9, -9]), 9.0, 0)],
 )
 def test_saturated_instants_are_counted_once(low, high, count):
     t = double([0.0, 1.0, 3.0, 4.0])

@@ -19,13 +19,12 @@ from pinn_dyn.evaluation import (
     save,
     sweep_figure,
     terms_figure,
-    tip_path_figure,
     trajectory_figure,
 )
 from pinn_dyn.evaluation.figures import modes_figure
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models.modes import modes_of
-from pinn_dyn.plots import BASELINE, log_limits
+from pinn_dyn.plots import BASELINE
 from pinn_dyn.systems import SoftArm
 
 
@@ -123,17 +122,6 @@ def record(coordinates=3, decay=3.0, runs=4):
     return ClosedLoopRecord(t, q, zero, u, u, Motion(q_ref, zero, zero), [None] * runs)
 
 
-def stop(closed_loop, run, sample):
-    """Stop one run: NaN from a sample on."""
-    names = ("q", "v", "u", "u_wanted")
-    values = {name: getattr(closed_loop, name).clone() for name in names}
-    for value in values.values():
-        value[run, sample:] = torch.nan
-    stopped = list(closed_loop.stopped)
-    stopped[run] = "0.80 s: too fast"
-    return dataclasses.replace(closed_loop, stopped=stopped, **values)
-
-
 def test_a_closed_loop_shows_states_references_errors_and_inputs():
     slow, fast = record(), record(decay=5.0)
     figure = closed_loop_figure({"slow": slow, "fast": fast}, 1, title="t", labels=["x", "y", "z"])
@@ -146,31 +134,6 @@ def test_a_closed_loop_shows_states_references_errors_and_inputs():
     size = np.linalg.norm([1.1, 2.1, 3.1])
     np.testing.assert_allclose(error.get_ydata(), size * np.exp(-5 * slow.t.numpy()))
     assert {line.get_drawstyle() for line in axes["u1"].lines} == {"steps-post"}
-
-
-def test_a_stop_is_marked_and_a_runaway_does_not_set_the_range():
-    lost = record(2)
-    lost.q[2, 39:], lost.u[2, 39:] = 1e3, -1e5
-    figure = closed_loop_figure({"law": stop(lost, 2, 41)}, 2, title="t")
-    assert "stopped: 0.80 s: too fast" in figure.get_suptitle()
-    for name, ax in panels(figure).items():
-        assert any(np.allclose(line.get_xdata(), 0.8) for line in ax.lines)
-        assert name.startswith("‖") or np.abs(ax.get_ylim()).max() < 2 * 7.2
-    at_once = stop(record(2), 0, 1)
-    at_once.u[0, 0] = torch.nan
-    closed_loop_figure({"law": at_once}, 0, title="t").draw_without_rendering()
-
-
-def test_the_tip_path_shows_the_distance_in_millimetres():
-    t = torch.linspace(0, 3, 61, dtype=torch.float64)
-    helix = torch.stack([t.cos(), t.sin(), 0.1 * t], -1)
-    near = helix + 0.001 * torch.tensor([2.0, 3.0, 6.0])
-    short = helix + 0.02 * t[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    short[30:] = torch.nan
-    _, ax = tip_path_figure(t, {"near": near, "short": short}, helix, title="t").axes
-    near_line, short_line = ax.lines
-    np.testing.assert_allclose(near_line.get_ydata(), 7.0)
-    np.testing.assert_allclose(short_line.get_ydata()[:30], 20 * t[:30])
 
 
 def test_a_sweep_has_a_line_through_the_means_over_seeds():
@@ -188,13 +151,6 @@ def test_a_sweep_has_a_line_through_the_means_over_seeds():
     np.testing.assert_allclose(drawn["lnn (1 of 6 diverged)"].get_ydata(), [3.0, 0.2, 0.02])
     np.testing.assert_allclose(drawn["mlp"].get_ydata(), [20.0, 2.0, 0.2])
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-
-
-def test_a_logarithmic_axis_shows_where_a_converging_curve_starts():
-    fast = torch.logspace(0, -8, 100)  # the error of a control law
-    low, high = log_limits([fast, 1e6 * torch.ones(100)])
-    assert low < 1e-6
-    assert 1 <= high < 10
 
 
 def test_modes_have_their_frequencies_dampings_and_shapes():

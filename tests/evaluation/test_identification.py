@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from pinn_dyn.identification.constants import (
-    common_factor,
     constants_table,
     contradicted,
     far_masses,
@@ -182,8 +181,3 @@ def test_masses_whose_interval_is_far_from_that_of_the_urdf_are_named():
     ]
     assert "the mass of arm is 1.36e+03 kg (1.34e+03 to 1.38e+03), in the URDF 1 kg" in text
     assert far_masses(table[table.name == "mass of hand"]) == []
-
-
-def test_the_common_factor_of_gains_is_that_of_their_mean(model):
-    variances = [1.0 if "gain" in name else 0.1 for name in model.parameter_names()]
-    assert common_factor(model, fit_with(model, variances)) == pytest.approx(np.exp(1.96 * 0.25))

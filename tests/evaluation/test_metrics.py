@@ -3,7 +3,6 @@ import math
 import pytest
 import torch
 
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
     Prediction,
     predict_trajectories,
@@ -143,12 +142,6 @@ def test_the_velocity_of_a_model_of_momenta_is_its_momentum_over_its_mass():
     torch.testing.assert_close(by_p.v_hat, by_v.v_hat, rtol=0, atol=1e-6)
 
 
-def test_metrics_refuse_shapes_that_do_not_match():
-    q = torch.zeros(2, 5, 3)
-    with pytest.raises(ValueError, match=r"q_hat has shape \(5, 3\) and q \(2, 5, 3\)"):
-        rollout_metrics(q[0], q, torch.arange(5.0), thresholds={})
-
-
 @pytest.mark.parametrize(("step", "stride"), [(None, 1), (0.25, 1), (0.5, 2), (1.0, 4)])
 def test_prediction_meets_the_closed_solution(step, stride):
     truth = ramps()
@@ -180,63 +173,7 @@ def test_windows_are_set_back_to_the_true_state():
     torch.testing.assert_close(prediction.error(), expected)
 
 
-def test_a_momentum_model_starts_from_the_momentum():
-    truth = ramps()
-    truth = Trajectory(truth.q, 7 * truth.v, truth.input, momentum=lambda q, v: v / 7)
-    model = PointMass(state="qp")
-    for prediction in (
-        predict_trajectories(model, truth),
-        predict_trajectories(model, truth, window=1.0),
-    ):
-        torch.testing.assert_close(prediction.q_hat, prediction.q)
-
-
-def test_the_input_moves_as_the_trajectory_says():
-    t = torch.arange(4, dtype=torch.float64)
-    u = torch.tensor([1.0, 0.0, -1.0, 5.0], dtype=torch.float64)
-    v = torch.tensor([0.0, 1.0, 1.0, 0.0], dtype=torch.float64)
-    q = torch.tensor([0.0, 0.5, 1.5, 2.0], dtype=torch.float64)
-    q, v, u = (x[None, :, None] for x in (q, v, u))
-    truth = Trajectory(q, v, Signal(t, u, "hold"))
-    prediction = predict_trajectories(PointMass(), truth)
-    torch.testing.assert_close(prediction.q_hat, prediction.q)
-
-
-def test_errors_name_what_does_not_fit():
-    truth, model = ramps(), PointMass()
-    with pytest.raises(ValueError, match=r"step is 0\.3 s and the sample time .* 0\.25 s"):
-        predict_trajectories(model, truth, step=0.3)
-    with pytest.raises(ValueError, match=r"step is 0\.1 s and the sample time .* 0\.25 s"):
-        predict_trajectories(model, truth, step=0.1)
-    with pytest.raises(ValueError, match=r"window is 0\.75 s and step is 0\.5 s"):
-        predict_trajectories(model, truth, window=0.75, step=0.5)
-    with pytest.raises(ValueError, match=r"window is 4\.0 s, but .* last only 3 s"):
-        predict_trajectories(model, truth, window=4.0)
-    uneven = Trajectory(truth.q, truth.v, Signal(truth.t**2, truth.u))
-    with pytest.raises(ValueError, match="sample time varies"):
-        predict_trajectories(model, uneven, step=0.25)
-
-
 # Ensembles.
-
-
-@pytest.mark.parametrize("windowed", [False, True])
-def test_an_ensemble_is_predicted_with_its_members(windowed):
-    """Point masses of gains 0.8, 1 and 1.5: their mean moves as one of gain 1.1."""
-    gains = (0.8, 1.0, 1.5)
-    truth = ramps()
-
-    def predict(model):
-        return predict_trajectories(model, truth, window=1.0 if windowed else None, step=0.5)
-
-    found = predict(Ensemble([PointMass(gain).eval() for gain in gains]))
-    assert found.members.shape == (3, *found.q.shape)
-    for member, gain in zip(found.members, gains, strict=True):
-        torch.testing.assert_close(member, predict(PointMass(gain)).q_hat, rtol=0, atol=1e-6)
-    torch.testing.assert_close(found.q_hat, predict(PointMass(1.1)).q_hat, rtol=0, atol=1e-6)
-    deviation = found.members.numpy().std(axis=0, ddof=1)[..., 0]
-    torch.testing.assert_close(found.spread(), torch.from_numpy(deviation), rtol=0, atol=1e-12)
-    assert predict(PointMass()).members is None
 
 
 def test_a_truth_that_is_like_a_member_is_calibrated_and_a_common_error_is_not():

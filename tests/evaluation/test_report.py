@@ -73,18 +73,6 @@ def test_control_laws_are_listed_with_the_reason_of_a_stop(control):
     assert stop == {"law": "pd", "run": "2", "reason": "1.20 s: A is singular"}
 
 
-def test_odd_names_stay_text(empty_pictures):
-    pages = [
-        prediction_page(names=(ODD, "lnn"))[0],
-        control_page(names=(ODD, "lnn"), title=ODD)[0],
-    ]
-    for text in pages:
-        page = Page(text)
-        assert not [attributes for _, attributes in page.tags if "onerror" in attributes]
-        assert ODD in page.text
-        assert "<img src=x" not in text
-
-
 def test_sections_of_constants_torques_and_parts_appear_with_their_data(prediction, empty_pictures):
     rows = [
         ["mass of link", 91.0548, 79.3, 102.8, "kg", 50.0, 0.999],
@@ -154,8 +142,8 @@ def test_a_slider_of_large_figures_stays_small():
     def figures():
         for number in range(20):
             figure = Figure(figsize=(12, 16))
-            noise = np.random.default_rng(number).normal(size=(40, 4000))
-            figure.subplots().plot(noise.T, linewidth=0.3)
+            noise = np.random.default_rng(number).normal(size=(300, 400))
+            figure.subplots().imshow(noise, cmap="gray")
             yield number, figure
 
     text = slider(figures(), "run")

@@ -2,10 +2,8 @@
 
 import shutil
 
-import pandas as pd
 import pytest
 
-from pinn_dyn.evaluation.report import page as report
 from tests.evaluation.report_pages import prediction_page
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
@@ -71,20 +69,6 @@ def set_width(browser, width):
     """Set the width of the page; Chromium makes no window narrower than 500 px."""
     screen = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-
-
-def test_words_of_a_wide_table_are_whole_on_a_phone(browser, tmp_path):
-    """The table scrolls inside itself, instead of a column of single letters."""
-    row = ["warning", "correlation of force and acceleration", "torque_x", "at least 0.1", "-0.128"]
-    frame = pd.DataFrame([[*row, "docs/bags_and_other_logs.md"]], columns=list("abcdef"))
-    file = tmp_path / "page.html"
-    section = report.Section("c", [report.table(frame)])
-    file.write_text(report.page("a", "b", [section]), encoding="utf-8")
-    set_width(browser, 390)
-    browser.get(file.as_uri())
-    height = "return Math.max(...[...document.querySelectorAll('td')].map(c => c.clientHeight))"
-    assert browser.execute_script(height) < 120
-    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
 
 
 @pytest.mark.parametrize("width", [390, 1280])

@@ -52,7 +52,7 @@ def test_a_link_carries_the_mass_of_the_next_one_as_a_point_at_its_joint():
     np.testing.assert_allclose(regressor, regressor[:, columns] @ expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", ["1.5707963267948966", "1.5708", "1.571", "1.57"])
+@pytest.mark.parametrize("angle", ["1.5707963267948966", "1.57"])
 def test_rounded_angles_of_a_urdf_add_no_base_parameter(angle):
     """Armatures 1 and 2 are grouped with links where axes are orthogonal (Gautier, Khalil 1990)."""
     parts = [link("base"), *(link(f"body{k}") for k in range(3))]

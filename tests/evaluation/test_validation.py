@@ -44,25 +44,6 @@ def test_the_error_is_that_of_the_horizon_re_set_every_window(window, errors, te
     assert str(validator(window)) == text
 
 
-@pytest.mark.parametrize(
-    ("window", "horizon", "step", "words"),
-    [
-        (None, 9.0, 0.5, "horizon is 9.0 s, but the trajectory lasts only 4 s"),
-        (None, 3.0, 0.3, "step is 0.3 s and the sample time of the data is 0.25 s"),
-        (1.25, 3.0, 0.5, "window is 1.25 s and step is 0.5 s"),
-    ],
-)
-def test_data_that_it_does_not_fit_are_refused_before_a_training(window, horizon, step, words):
-    with pytest.raises(ValueError, match=words.replace(".", r"\.")):
-        validator(window, horizon, step).check(truth())
-
-
-@pytest.mark.parametrize("window", [0.25, 4.0])
-def test_a_window_between_a_step_and_the_horizon_is_expected(window):
-    with pytest.raises(ValueError, match=r"expected step <= window <= horizon"):
-        validator(window)
-
-
 @pytest.mark.parametrize("rate", [1.0, 0.01])
 def test_the_windowed_error_is_in_units_of_standing_still(rate):
     """Speeds 0.5 and -1: standing still errs by their size times the time, 0.75 on the mean.

@@ -81,10 +81,9 @@ def test_the_example_log_determines_a_model_that_controls(home):
     for name in ("own_log.py", "example_log.csv"):
         shutil.copy(EXAMPLES / name, folder)
     run(str(folder / "own_log.py"), "--folder", "runs/whole", "--steps", "400")
-    for gains in (["2", "0.4"], ["5", "0.4"]):
-        text = run("regulator_in_a_loop.py", "runs/whole", "--duration=3", "--gains", *gains)
-        errors = re.search(r"final error: \[(.*)\]", text)[1].split()
-        assert max(map(float, errors)) < 0.01  # of steps of 0.4 and 0.3 rad
+    text = run("regulator_in_a_loop.py", "runs/whole", "--duration=3", "--gains", "5", "0.4")
+    errors = re.search(r"final error: \[(.*)\]", text)[1].split()
+    assert max(map(float, errors)) < 0.01  # of steps of 0.4 and 0.3 rad
     assert "largest distance" in run("torque_feedforward.py", "runs/whole")
 
 

@@ -168,10 +168,9 @@ def test_powers_are_powers_and_constants_of_floats_are_floats(tmp_path, function
     subprocess.run(command, cwd=tmp_path, check=True)
 
 
-@pytest.mark.parametrize("real", ["double", pytest.param("float", marks=pytest.mark.slow)])
-def test_the_stack_of_the_header_suffices(tmp_path, real):
+def test_the_stack_of_the_header_suffices(tmp_path):
     model = MODELS[CONSTANT]().double().eval().requires_grad_(False)
-    path = export(model, tmp_path / "arm.c", real=real)
+    path = export(model, tmp_path / "arm.c")
     header = path.with_suffix(".h").read_text()
     stated = re.findall(r"Stack: at most (\d+) bytes. \*/\n\w+ (\w+)\(", header)
     for level in ("-O1", "-O3"):

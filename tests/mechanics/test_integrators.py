@@ -6,13 +6,13 @@ import pytest
 import torch
 from torchdiffeq import odeint
 
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
 from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
+from pinn_dyn.mechanics.integrators import Wrapped
 from pinn_dyn.mechanics.rollout import path_between, step_grid
 from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkPotential
 from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
-from tests.models.builders import make_structured, perturb
+from tests.models.builders import make_structured
 
 
 def samples(batch, count, size, seed=0):
@@ -30,7 +30,7 @@ def test_the_loop_gives_what_torchdiffeq_gives(interpolation, batch, substeps):
     u = samples(batch, count, 1)
     x0 = samples(batch, 1, 4, seed=1).squeeze(-2)
     signal, t = Signal(t_input, u, interpolation), t_input[::2]
-    path = path_between(system, RK4(substeps), x0, t, signal)
+    path = path_between(system, Wrapped(RK4(substeps)), x0, t, signal)
 
     def rate(time, x):
         return system.state_derivative(x, signal.at(time[None])[0])
@@ -83,20 +83,6 @@ def test_a_rosenbrock_step_over_many_samples_of_the_input_loses_no_impulse(inter
     found = system.predict(x0, t[::10], Signal(t, u, interpolation))[:, 0]
     assert moved[::10].diff().abs().max() > 0.04
     torch.testing.assert_close(found, moved[::10], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", ["lnn", "hnn"])
-def test_an_ensemble_integrates_as_its_members_do(kind):
-    t = 0.02 * torch.arange(4, dtype=torch.float64)
-    u, x0 = samples((4,), 4, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
-    members = [perturb(make_structured(kind), seed=k, spread=0.1) for k in range(3)]
-    explicit = Ensemble(members).member_increments(x0, t, Signal(t, u))
-    for item in members:
-        item.integrator = Rosenbrock()
-    found = Ensemble(members).member_increments(x0, t, Signal(t, u))
-    expected = torch.stack([item.increments(x0, t, Signal(t, u)) for item in members])
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-    assert (found - explicit).abs().max() > 1e-7
 
 
 @pytest.mark.slow

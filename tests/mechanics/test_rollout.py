@@ -61,17 +61,6 @@ def test_times_off_by_a_last_digit_take_the_same_samples_of_a_held_input(
     assert (found - exact).abs().max() < 1e-12
 
 
-def test_a_step_of_the_input_acts_from_its_sample_when_held_and_before_it_when_linear(system):
-    t = torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)
-    u = torch.tensor([[0.0], [1.0], [1.0]], dtype=torch.float64)
-    rest = torch.zeros(4, dtype=torch.float64)
-    held = rollout(system.velocity_derivative, rest, t, Signal(t, u, "hold"))
-    linear = rollout(system.velocity_derivative, rest, t, Signal(t, u, "linear"))
-    assert torch.equal(held[1], rest)
-    assert held[2].abs().max() > 0.05
-    assert linear[1].abs().max() > 0.02
-
-
 # Order of the method.
 
 
@@ -142,23 +131,6 @@ def test_a_state_of_more_than_q_and_v_stays_inside_the_rollout():
     assert float(x[-1, 1]) == pytest.approx(float(expected), abs=1e-4)
 
 
-class StartsFaster(LinearSystem):
-    """Masses whose motion starts at v + u instead of the measured v."""
-
-    def initial_state(self, x0, u0):
-        q, v = x0.chunk(2, -1)
-        return torch.cat([q, v + u0], dim=-1)
-
-
-def test_increments_are_relative_to_the_measured_start(system):
-    started = StartsFaster(system.mass, system.stiffness, system.damping, system.inputs)
-    t, u = samples(11, 0.05)
-    found = started.requires_grad_(False).predict(START, t, Signal(t, u))
-    start = torch.cat([START[:2], START[2:] + u[0]])
-    assert torch.equal(found[0], START)
-    torch.testing.assert_close(found[1:], system.predict(start, t, Signal(t, u))[1:])
-
-
 # Bad input.
 
 
@@ -166,9 +138,7 @@ def test_increments_are_relative_to_the_measured_start(system):
     ("change", "message"),
     [
         ({"x0": torch.tensor([0.0, torch.nan, 0.0, 0.0])}, r"x0 has 1 non-finite.*index \(1,\)"),
-        ({"t": torch.zeros(1)}, r"t has shape \(1,\)"),
         ({"u": torch.zeros(2, 4, 1)}, r"u has batch shape \(2,\), expected that of x0"),
-        ({"t": torch.tensor([0.0, 2.0, 1.0, 3.0])}, "t must increase strictly"),
     ],
 )
 def test_bad_input_is_refused_by_name(change, message):

@@ -35,8 +35,6 @@ def trajectory(samples=11, step=0.1, start=0.0, batch=(), **changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"t": torch.zeros(1), "u": torch.zeros(1, 2)}, r"^t has shape \(1,\).*at least 2"),
-        ({"q": torch.zeros(10, 3)}, r"^q has shape \(10, 3\), expected \(11, 3\)"),
         ({"v": torch.zeros(11, 2)}, r"^v has shape \(11, 2\), expected \(11, 3\)"),
         ({"u": torch.zeros(10, 2)}, r"^u has shape \(10, 2\), expected \(\*batch, 11, M\)"),
     ],
@@ -90,17 +88,6 @@ def test_stack_adds_a_batch_dimension_and_starts_at_zero():
     torch.testing.assert_close(both.t, early.t)
     assert torch.equal(both.u[1], late.u)
     assert both.momentum is twice
-
-
-@pytest.mark.parametrize("other", [{"samples": 10}, {"step": 0.2}], ids=["samples", "step"])
-def test_stack_refuses_other_sample_times_by_index(other):
-    with pytest.raises(ValueError, match="trajectory 1 has other sample times"):
-        stack([trajectory(), trajectory(**other)])
-
-
-def test_stack_refuses_mixed_interpolations():
-    with pytest.raises(ValueError, match="interpolation"):
-        stack([trajectory(), trajectory(interpolation="hold")])
 
 
 def test_of_unequal_lengths_those_are_stacked_that_last_long_enough():

@@ -7,12 +7,10 @@ from pinn_dyn.mechanics import Signal
 from pinn_dyn.models import (
     AccelerationMLP,
     CoulombFriction,
-    NetworkPotential,
     NextStateMLP,
 )
 from pinn_dyn.testing import assert_near
 from tests.models.builders import (
-    make_scales,
     make_statistics,
     make_structured,
     perturb,
@@ -45,12 +43,3 @@ def test_black_boxes_see_angles_too(kind):
     turn = torch.tensor([0.0, 2 * torch.pi], dtype=torch.float64)
     assert_near(increments(q + turn), increments(q), 1e-11)
     assert (increments(q + turn.flip(0)) - increments(q)).abs().max() > 1e-4
-
-
-def test_the_quadratic_well_leaves_angles_out():
-    assert NetworkPotential(make_scales(2, 1, angles=[0, 1]), hidden=[4]).stiffness_root is None
-    mixed = perturb(NetworkPotential(make_scales(2, 1, angles=[0]), hidden=[4]).double())
-    q, _, _, _ = random_batch(2, 2)
-    turn = torch.tensor([2 * torch.pi, 0.0], dtype=torch.float64)
-    assert_near(mixed(q + turn), mixed(q), 1e-12)
-    assert_near(mixed.gradient(q + turn), mixed.gradient(q), 1e-12)

@@ -71,14 +71,6 @@ def test_a_wrong_step_is_refused_with_the_right_one(model, start, inputs):
         model.predict(start, uneven, Signal(uneven, inputs))
 
 
-def test_a_step_is_allowed_the_rounding_of_its_times(model, start, inputs):
-    assert_near(
-        model.predict(start, T.float(), Signal(T.float(), inputs)),
-        model.predict(start, T, Signal(T, inputs)),
-        1e-12,
-    )
-
-
 def test_acceleration_is_scaled_by_the_data_and_velocity_is_exact(start):
     model = make_model("acceleration").requires_grad_(False)
     s = make_statistics(2, 2)

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from pinn_dyn.models import MLP, ChainPotential, LagrangianNetwork, NetworkCholesky
+from pinn_dyn.models import MLP, ChainPotential, NetworkCholesky
 from pinn_dyn.testing import assert_near
-from tests.models.builders import CHAIN, make_scales, make_structured, perturb
+from tests.models.builders import make_scales, perturb
 
 GRAVITY = torch.tensor([0.3, -0.4, 9.7], dtype=torch.float64)
 JOINTS = 4
@@ -102,21 +102,7 @@ def test_the_head_for_a_chain_depends_on_what_a_true_chain_depends_on(q):
     assert int(dependence(perturb(free.double()), q[0]).sum()) > int(rule().sum())
 
 
-def test_a_mask_stays_while_weights_are_trained(q):
-    """The masked weights get no gradient, and no optimizer moves the output by them."""
-    torch.manual_seed(3)
-    head = NetworkCholesky(scales(angles=range(JOINTS)), hidden=[12], chain=True)
-    head = perturb(head.double())
-    head(q).square().sum().backward()
-    network = head.network
-    for k, layer in enumerate(network.linears):
-        mask = network.get_buffer(f"mask_{k}")
-        assert not layer.weight.grad[mask == 0].any()
-        assert layer.weight.grad[mask == 1].any()
-    assert not any("mask" in name for name in head.state_dict())
-
-
-@pytest.mark.parametrize("angles", [(), (0, 1, 2), (1,)], ids=["lengths", "angles", "mixed"])
+@pytest.mark.parametrize("angles", [(), (1,)], ids=["lengths", "mixed"])
 def test_the_masked_passes_are_those_of_automatic_differentiation(angles):
     torch.manual_seed(3)
     network = perturb(MLP(3, 4, [7, 6], angles=angles, after=[0, 1, 2, 0]).double())
@@ -127,12 +113,6 @@ def test_the_masked_passes_are_those_of_automatic_differentiation(angles):
     tangent = torch.func.jvp(network, (x,), (dx,))[1]
     assert_near(network.linearize_along(x, dx)[1], tangent, 1e-12)
     assert_near(network.pullback(tape, dy), torch.func.vjp(network, x)[1](dy)[0], 1e-12)
-
-
-def test_a_lagrangian_chain_needs_the_transposed_form():
-    with pytest.raises(ValueError, match="transposed=true"):
-        make_structured("lnn", **CHAIN["hnn"])
-    assert isinstance(make_structured("lnn", **CHAIN["lnn"]), LagrangianNetwork)
 
 
 # The potential.
@@ -161,9 +141,3 @@ def test_three_rows_hold_the_potential_of_a_true_chain(q):
     assert_near(head(q), expected, 1e-12)
     force = torch.stack([torch.func.grad(true_potential)(row) for row in q])
     assert_near(head.gradient(q), force, 1e-12)
-
-
-@pytest.mark.parametrize("angles", [[], [0, 1, 3]])
-def test_the_potential_is_refused_where_a_coordinate_is_not_an_angle(angles):
-    with pytest.raises(ValueError, match=r"angles is .* expected all 4 coordinates"):
-        ChainPotential(scales(1.0, angles))

@@ -166,11 +166,10 @@ def test_the_scale_is_honoured(q):
     [
         positive_matrix(3),
         [[0.0, 0.0, 0.0]] * 3,
-        [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [3.0, 6.0, 9.0]],
         [[0.0, 0.0, 0.0], [0.0, 2.0, -1.0], [0.0, -1.0, 1.0]],
         [[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 5.0]],
     ],
-    ids=["regular", "zero", "rank 1", "zero first row", "rank 2"],
+    ids=["regular", "zero", "zero first row", "rank 2"],
 )
 def test_a_fixed_matrix_is_reproduced_also_if_singular(value, q):
     head = FixedCholesky(scales(), value=value)

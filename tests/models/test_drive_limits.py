@@ -3,11 +3,9 @@
 from functools import partial
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
-from pinn_dyn import check
 from pinn_dyn.control import (
     ComputedTorque,
     Pipeline,
@@ -17,7 +15,6 @@ from pinn_dyn.control import (
     close_loop,
 )
 from pinn_dyn.control.contracts import Motion
-from pinn_dyn.data import LogSource
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.exports.c_file import find_compiler
 from pinn_dyn.identification.constants import constants_table
@@ -43,21 +40,6 @@ DC = partial(DriveLimits, limit=LIMIT, stall=STALL, no_load_speed=SPEED)
 def hard(s, v):
     ends = [min(LIMIT, max(STALL * (1 - w / SPEED), 0.0)) for w in (v, -v)]
     return min(max(s, -ends[1]), ends[0])
-
-
-@pytest.mark.parametrize("kind", [np.array, torch.tensor])
-def test_limits_may_be_arrays_and_tensors(kind):
-    numbers, v = [3.0, 4.0], torch.tensor([[0.5, -0.5]])
-    drives = [
-        DriveLimits(unit_scales(2), limit=values, stall=values, no_load_speed=values)
-        for values in (numbers, kind(numbers))
-    ]
-    servos = [
-        Servo(unit_scales(2), stiffness=values, limit=values) for values in (numbers, kind(numbers))
-    ]
-    force = torch.tensor([[10.0, -10.0]])
-    assert torch.equal(*(drive(force, v) for drive in drives))
-    assert torch.equal(*(servo.largest_force() for servo in servos))
 
 
 def recording(seed, seconds=20.0, rate=200.0, loss=0.0, scale=1.5, limited=hard):
@@ -234,20 +216,6 @@ def test_a_loss_stays_only_if_it_predicts_better(loss, caplog):
     else:
         assert table.value["loss by load of hinge"] < 0.02
     assert table.value["m cz of arm"] == pytest.approx(-MASS * LENGTH, rel=0.03)
-
-
-def test_the_check_of_a_log_names_a_drive_that_saturates(motions):
-    frames = {
-        f"run{k}": pd.DataFrame({"t": x.t, "q": x.q[:, 0], "v": x.v[:, 0], "u": x.u[:, 0]})
-        for k, x in enumerate([*motions, recording(2)])
-    }
-    columns = {
-        x: {"columns": x, "unit": y} for x, y in zip("qvu", ("rad", "rad/s", "Nm"), strict=True)
-    }
-    source = LogSource(files=frames, time={"columns": "t", "unit": "s"}, **columns)
-    texts = [x.text for x in check(source).measurements if x.verdict != "ok"]
-    assert any("is a command that its drive cannot follow" in text for text in texts)
-    assert not any("acts" in text and "after it is logged" in text for text in texts)
 
 
 def test_wrong_limits_are_refused():

@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.identification.constants import constants_table
-from pinn_dyn.identification.payload import identify_payload
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory
 from pinn_dyn.models import ElasticJoints, KnownMechanics, Servo
 from pinn_dyn.systems import RigidChain
@@ -49,12 +48,6 @@ def test_each_spring_is_between_a_link_and_its_motor():
         assert_near(x @ matrix, model.elastic.forces(*at) @ model.elastic.stretch, 1e-9)
 
 
-def test_units_of_springs_are_those_of_their_joints():
-    springs = elastic_model(joints=("bend", "slide")).elastic
-    assert list(springs.stiffness.named().units) == ["Nm/rad", "N/m"]
-    assert list(springs.damping.named().units) == ["Nms/rad", "Ns/m"]
-
-
 ARM = robot(
     link("base"),
     link("upper", 2.0),
@@ -65,11 +58,9 @@ ARM = robot(
 K, D, B, FRICTION = np.array([300.0, 150.0]), np.array([0.6, 0.3]), np.array([0.2, 0.1]), 0.4
 
 
-def flexible_arm(seconds, seed, rate=500.0, noise=2e-5, load=None):
+def flexible_arm(seconds, seed, rate=500.0, noise=2e-5):
     """A motion by Pinocchio's forward dynamics and SciPy's implicit solver."""
     model = pinocchio.buildModelFromXML(ARM)
-    if load is not None:
-        model.inertias[2] += pinocchio.Inertia(*load)
     data, rng = model.createData(), np.random.default_rng(seed)
     frequency, phase = rng.uniform(0.2, 3.0, (2, 6)), rng.uniform(0, 6, (2, 6))
 
@@ -89,21 +80,6 @@ def flexible_arm(seconds, seed, rate=500.0, noise=2e-5, load=None):
     t = torch.from_numpy(t)
     u = torch.from_numpy(np.array([torque(time) for time in t.numpy()]))
     return Trajectory(q, v, Signal(t, u, "cubic"))
-
-
-@pytest.mark.slow
-def test_a_load_behind_elastic_joints_is_identified():
-    mass, center = 0.9, np.array([0.05, -0.03, -0.1])
-    runs = [[flexible_arm(8.0, k, load=x)] for k, x in enumerate((None, (mass, center, np.eye(3))))]
-    windows = draw_windows(runs[0], count=60, steps=10, stride=1, seed=0)
-    model = KnownMechanics(windows.statistics(), ElasticJoints(RigidChain(ARM)), start="generic")
-    table = identify_payload(model, *runs, cutoff=20.0, samples=2000).set_index("name")
-    assert table.attrs["frame"] == "lower"
-    for name, value in zip(
-        ("mass", "center x", "center z", "Iyy"), (mass, 0.05, -0.1, 1), strict=True
-    ):
-        assert table.value[name] == pytest.approx(value, rel=0.01)
-        assert table.determined[name] == "yes"
 
 
 @pytest.mark.slow

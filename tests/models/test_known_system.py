@@ -4,12 +4,11 @@ import pytest
 import torch
 
 from pinn_dyn.models import KnownMechanics, KnownSystem
-from pinn_dyn.systems import RigidChain, SoftArm
+from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import MechanicalSystemContract
 from tests.support.cart_pole import CartPole
 from tests.support.contracts import one_case, slow_except
 from tests.support.known import anywhere, known_arm, known_cart_pole, statistics
-from tests.support.rigid_chains import TREE
 
 
 @one_case
@@ -112,13 +111,8 @@ class Unmeasured(SoftArm):
     ("structure", "message"),
     [
         (Unnamed(), r"structure Unnamed has the constants \{\}, expected a unit"),
-        (RigidChain(TREE, locked_joints=["wrist", "turn"]), "RigidChain has the constants"),
         (Unmeasured(), "Unmeasured has the constants .*stiffness.*expected a unit for each entry"),
         (SoftArm(stiffness=0.0), r"stiffness 1: start is .* expected positive"),
-        (
-            SoftArm(2),
-            "the data have 3 coordinates and 3 inputs, but SoftArm has 6 coordinates",
-        ),
         (CartPole(), "but CartPole has 2 coordinates and 1 inputs"),
     ],
 )

@@ -119,19 +119,3 @@ def test_degree_two_recovers_a_quadratic_system_and_degree_one_cannot():
         errors[degree] = float((x[:, :1] - test.q).abs().max())
     assert errors[2] < 1e-6
     assert errors[1] > 1e-3
-
-
-def test_errors_say_what_was_expected():
-    train = oscillators(2, samples=20)
-    with pytest.raises(ValueError, match="shorter than 30 steps"):
-        LinearRival(train, step=STEP, lags=30, degree=1, ridge=1e-7)
-    with pytest.raises(ValueError, match=r"step is 0\.07 s .* integer multiple"):
-        LinearRival(train, step=0.07, lags=1, degree=1, ridge=1e-7)
-    with pytest.raises(ValueError, match="use fewer lags"):
-        LinearRival(train, step=STEP, lags=8, degree=2, ridge=1e-7)
-    rival = LinearRival(train, step=STEP, lags=1, degree=1, ridge=1e-7)
-    t = 0.1 * torch.arange(3)
-    with pytest.raises(ValueError, match=r"predicts in steps of 0\.05 s, but t advances by 0\.1"):
-        rival.predict(torch.zeros(4), t, Signal(t, torch.zeros(3, 1)))
-    with pytest.raises(ValueError, match="no linear model can be fitted: all training"):
-        fit_linear_rival(oscillators(1, samples=2), train, step=STEP, degree=1)

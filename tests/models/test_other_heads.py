@@ -114,18 +114,3 @@ def test_linear_inputs_of_a_nonlinear_input_have_constant_columns(q):
     expected = torch.einsum("bij,bj->bi", values * torch.tensor([3.0, 2.0]).double(), u[:, 1:])
     expected = expected + 0.5 * torch.arange(1.0, SIZE + 1).double() * u[:, :1]
     assert_near(head.force(q, u), expected, 1e-12)
-
-
-@pytest.mark.parametrize("linear", [[0, 1], [2], [1, 1]])
-def test_a_nonlinear_input_refuses_linear_inputs_that_are_not_there(linear):
-    with pytest.raises(ValueError, match=r"linear is .*expected different inputs from 0 to 1"):
-        make_input(partial(NonlinearInput, hidden=[4], linear=linear))
-
-
-def test_the_matrix_of_a_nonlinear_input_is_that_at_the_mean_input(q):
-    head = make_nonlinear()
-    mean = U_MEAN.expand(40, 2)
-    assert head(q).shape == (40, SIZE, 2)
-    assert_near((head(q) @ mean.unsqueeze(-1)).squeeze(-1), head.force(q, mean), 1e-6)
-    assert not head.affine
-    assert make_input(partial(NetworkInput, hidden=[4])).affine

@@ -1,6 +1,5 @@
 """Position servos: passive mechanical systems whose inputs are targets."""
 
-from dataclasses import replace
 from functools import partial
 
 import mujoco
@@ -15,10 +14,7 @@ from pinn_dyn.mechanics import Rosenbrock, Signal, Trajectory
 from pinn_dyn.models import (
     ConstantCholesky,
     CoulombFriction,
-    KnownAndNetwork,
     KnownMechanics,
-    LagrangianNetwork,
-    NoInput,
     Servo,
 )
 from pinn_dyn.systems import RigidChain
@@ -26,8 +22,7 @@ from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from pinn_dyn.training import LeastSquares
 from tests.models.builders import make_structured, random_batch
 from tests.support.contracts import one_case
-from tests.support.known import known_model, statistics, unit_scales
-from tests.support.rigid_chains import TREE
+from tests.support.known import known_model, unit_scales
 
 
 @pytest.mark.parametrize(
@@ -37,7 +32,6 @@ from tests.support.rigid_chains import TREE
         ("hnn", None),
         ("feed-forward", 2.0),
         ("known", "learned"),
-        pytest.param("sum", 2.0, marks=pytest.mark.slow),
     ],
 )
 @one_case
@@ -49,12 +43,6 @@ class TestServo(MechanicalSystemContract):
         servo = partial(Servo, limit=limit)
         if kind == "known":
             return known_model(friction=None, input=servo)
-        if kind == "sum":
-            part = partial(KnownMechanics, structure=RigidChain(TREE), input=servo)
-            network = partial(LagrangianNetwork, input=NoInput)
-            model = KnownAndNetwork(statistics(5), part, network).double()
-            model.parts["known"].structure = RigidChain(TREE)
-            return model
         if kind == "feed-forward":
             return make_structured("lnn", 3, 4, input=partial(servo, joints=[0, 2]))
         return make_structured(kind, input=servo, friction=CoulombFriction)
@@ -133,41 +121,6 @@ def test_an_implicit_step_is_stable_with_a_stiff_servo(kind):
     implicit, explicit = (model.predict(x0, t, Signal(t, target.expand(51, 2))) for model in models)
     assert float((implicit[-1, :2] - target).abs().max()) < 1e-3
     assert not float(explicit.nan_to_num(torch.inf).abs().max()) < 10
-
-
-def test_targets_are_in_the_order_of_their_joints():
-    servo = make_structured(
-        "lnn", 3, 2, input=partial(Servo, joints=[2, 0], stiffness=[4.0, 9.0], limit=1e6)
-    ).input
-    q, v, _, u = random_batch(3, 2)
-    (k, d), (k0, d0) = zip(servo.spring_constant(), servo.damping(), strict=True)
-    pull = [k0 * (u[:, 1] - q[:, 0]) - d0 * v[:, 0], k * (u[:, 0] - q[:, 2]) - d * v[:, 2]]
-    assert_near(servo.motor_force(q, v, u)[:, [0, 2]], torch.stack(pull, dim=-1), 1e-6)
-    assert_near(servo.springs(), torch.stack([k0, 0 * k, k]), 1e-6)
-
-
-def test_typical_forces_and_units_follow_from_the_stiffness():
-    """The coordinates have a spread of 1, and a typical error of a tenth of that."""
-    head = Servo(unit_scales(2), stiffness=[20.0, 40.0], limit=4.0, spread=0)
-    assert_near(head.typical_force(torch.ones(2)), torch.tensor([2.0, 4.0]), 1e-6)
-    assert_near(head.strength(), 1 / torch.tensor([1 / 20 + 0.1 / 4, 1 / 40 + 0.1 / 4]), 1e-6)
-    constants = known_model(input=partial(Servo, limit="learned")).drives.physical_constants()
-    units = {
-        name: unit for part in constants for name, unit in zip(part.names, part.units, strict=True)
-    }
-    assert units["servo stiffness of turn"] == "Nm/rad"
-    assert units["servo stiffness of slide"] == "N/m"
-    assert units["servo damping of slide"] == "Ns/m"
-    assert units["servo limit of slide"] == "N"
-
-
-def test_the_network_of_a_sum_has_the_scales_of_the_servos_forces():
-    """Feed-forward forces double the inputs, but not the forces."""
-    scales = replace(statistics(5), u_mean=torch.zeros(10), u_std=torch.ones(10))
-    part = partial(KnownMechanics, structure=RigidChain(TREE), input=Servo)
-    model = KnownAndNetwork(scales, part, partial(LagrangianNetwork, input=NoInput))
-    assert model.num_inputs == 10
-    assert_near(model.force, model.known.typical_force, 1e-6)
 
 
 MASS, LENGTH, STIFFNESS, DAMPING, LIMIT = 0.05, 0.1, 0.8, 0.02, 0.12

@@ -4,7 +4,6 @@ import json
 from dataclasses import fields
 from functools import partial
 
-import pytest
 import torch
 
 from pinn_dyn.models import (
@@ -60,15 +59,3 @@ def test_heads_start_at_the_scales_of_the_data():
     torch.testing.assert_close(scales["F"], uncorrelated.sqrt())
     torch.testing.assert_close(scales["D"], (uncorrelated.sqrt() / data.v_std).sqrt())
     torch.testing.assert_close(scales["V"], uncorrelated.mean().sqrt() * data.q_std.mean())
-
-
-@pytest.mark.parametrize("repeat", [1, 2])
-def test_network_input_is_state_and_inputs(repeat):
-    statistics = make_statistics(3, 2)
-    mean, std = statistics.network_input(repeat_input=repeat)
-    assert mean.tolist() == [
-        *statistics.q_mean.tolist(), 0, 0, 0, *statistics.u_mean.tolist() * repeat
-    ]  # fmt: skip
-    assert std.tolist() == [
-        *statistics.q_std.tolist(), *statistics.v_std.tolist(), *statistics.u_std.tolist() * repeat
-    ]  # fmt: skip

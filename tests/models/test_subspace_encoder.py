@@ -115,19 +115,6 @@ def test_the_history_has_all_steps_that_fit():
     assert SubspaceEncoder(statistics, history=0.3).history_steps == 3  # 0.3 / 0.1 is below 3
 
 
-def test_weights_with_one_time_constant_are_loaded(model):
-    weights = model.state_dict()
-    fade = torch.linspace(-1, 3, 4).double()
-    del weights["share"]
-    model.load_state_dict({**weights, "fade": fade})
-    x0, u = torch.randn(4).double(), motion(5, seed=1).u
-    path = model.increments(x0, T, Signal(T, u))
-    with torch.no_grad():
-        model.share.copy_(torch.randn(4, 4))  # the shares of equal terms do not matter
-    assert_near(model.increments(x0, T, Signal(T, u)), path, 1e-12)
-    assert torch.equal(torch.sigmoid(model.fade), torch.sigmoid(fade)[:, None].expand(4, 4))
-
-
 def test_steps_with_a_memory_repeat_a_rollout(model):
     q, v, _, _ = random_batch(2, 2)
     u = motion(5, seed=1).u.expand(len(q), -1, -1)

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import torch
 from scipy.integrate import solve_ivp
+from scipy.ndimage import gaussian_filter1d
 
 from pinn_dyn.data.logs import Recording
 from pinn_dyn.systems import RigidChain
@@ -105,6 +106,35 @@ def log(kind, seed, delay, *, seconds=12.0, rate=100.0, noise=1e-3, highest=2.0,
         x = solve_ivp(rate_of_change, (0, t[-1]), np.zeros(2), t_eval=t, rtol=1e-6, atol=1e-8)
         q, u = x.y.T[:, :n], signal(t)
     return Recording("run", t, q + noise * np.ptp(q, axis=0) * rng.normal(size=q.shape), None, u)
+
+
+def motor_arm(seed, delay, *, rate=100.0, seconds=40.0):
+    """One to three bends of an arm with inertia, which two to four motors pull by elastic cables.
+
+    The angles of the motors are sines and smooth steps, and act ``delay`` s after they are logged.
+    """
+    rng, step, margin = np.random.default_rng(seed), 0.002, 0.5
+    size, count = ((2, 3), (2, 4), (3, 3), (1, 2), (3, 4))[seed % 5]
+    t = np.arange(-margin, seconds + margin, step)
+    motors = sines(rng, count, size=0.7, lowest=0.05, highest=1.0)(t)
+    held = round(rng.uniform(0.6, 2.0) / step)
+    levels = rng.uniform(-1, 1, (len(t) // held + 1, count)).repeat(held, axis=0)[: len(t)]
+    motors += gaussian_filter1d(levels, 0.05 / step, axis=0)
+    pull = rng.normal(size=(size, count))
+    pull /= np.linalg.norm(pull, axis=0)
+    pretension, cubic = rng.uniform(0, 2), rng.uniform(0.1, 0.5, size)
+    frequency, ratio = 2 * np.pi * rng.uniform(0.8, 3), rng.uniform(0.3, 3)
+    q, v, motion = np.zeros(size), np.zeros(size), []
+    for u in motors:
+        stretch = pretension + u - 0.5 * (q @ pull)
+        force = pull @ (stretch + np.sqrt(stretch**2 + 0.05)) / 2 - q - cubic * q**3
+        v = (v + step * frequency**2 * force) / (1 + 2 * step * ratio * frequency)
+        q = q + step * v
+        motion.append(q)
+    times = np.arange(round((seconds - margin) * rate)) / rate
+    q = np.column_stack([np.interp(times, t, x) for x in np.transpose(motion)])
+    u = np.column_stack([np.interp(times + delay, t, x) for x in motors.T])
+    return Recording("run", times, q + 1e-3 * np.ptp(q, axis=0) * rng.normal(size=q.shape), None, u)
 
 
 def resting(dry, *, seconds=60.0, rate=200.0, late=0, seed=0):

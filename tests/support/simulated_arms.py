@@ -33,3 +33,18 @@ def states(arm, count=4):
     rng = np.random.default_rng(0)
     q = rng.uniform(arm.q_low, arm.q_high, (count, arm.num_coordinates))
     return q, *(rng.uniform(-2, 2, (2, *q.shape)))
+
+
+# Skew axes, turned frames and products of inertia.
+SPATIAL = """<robot name="spatial">
+  <link name="base"/>
+  <link name="one"><inertial><origin xyz="0.1 0.02 -0.3" rpy="0.3 -0.5 1.1"/><mass value="1.5"/>
+    <inertia ixx="0.09" ixy="0.01" ixz="-0.015" iyy="0.07" iyz="0.02" izz="0.1"/></inertial></link>
+  <link name="two"><inertial><origin xyz="0 0.1 -0.2" rpy="-0.7 0.2 0.4"/><mass value="0.8"/>
+    <inertia ixx="0.05" ixy="-0.01" ixz="0.005" iyy="0.04" iyz="0.01" izz="0.06"/></inertial></link>
+  <joint name="a" type="revolute"><parent link="base"/><child link="one"/>
+    <origin rpy="0.4 0.1 -0.3"/><axis xyz="0 0 1"/><limit lower="-2" upper="2"/></joint>
+  <joint name="b" type="revolute"><parent link="one"/><child link="two"/>
+    <origin xyz="0.1 0.2 -0.5" rpy="-1.2 0.5 0.2"/><axis xyz="0.6 0 0.8"/>
+    <limit lower="-2" upper="2"/></joint>
+</robot>"""

@@ -1,8 +1,6 @@
 """Robots from MJCF files against MuJoCo."""
 
-import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,26 +142,3 @@ def test_an_mjcf_that_mujoco_refuses_is_named(tmp_path):
     with pytest.raises(ValueError, match=f"{path}: .*axis") as error:
         RigidChain(str(path))
     assert "\n" not in str(error.value)
-
-
-ROBOTS = Path(os.environ.get("PINN_DYN_MENAGERIE", "menagerie"))
-FILES = sorted(path for path in ROBOTS.rglob("*.xml") if "<joint" in path.read_text("utf-8"))
-
-
-@pytest.mark.skipif(
-    not FILES, reason=f"no {ROBOTS}: the folder of mujoco_menagerie is PINN_DYN_MENAGERIE"
-)
-@pytest.mark.parametrize("path", FILES, ids=str)
-def test_robots_of_the_menagerie_load(path):
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        if "file" not in str(error):
-            pytest.skip(f"MuJoCo refuses it: {error}")
-        model = None  # meshes are missing
-    if model is not None and not set(model.jnt_type) & {2, 3}:
-        pytest.skip("no joint moves")
-    chain = RigidChain(str(path))
-    if model is not None:
-        model.opt.gravity[:] = [0, 0, -9.81]
-        assert_equals_mujoco(RigidChain(str(path), joints=chain.tree.movable), model)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.run.training.trainer import has_cpp_compiler
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia
 from pinn_dyn.testing import MechanicalSystemContract
@@ -16,7 +15,6 @@ from tests.support.rigid_chains import TREE, joint, link, robot
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 STATES = 100
-NEEDS_COMPILER = pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
 
 
 def urdf_file(name):
@@ -106,14 +104,6 @@ class TestRigidChainContract(MechanicalSystemContract):
         return RigidChain(TREE, locked_joints=["wrist"], damping=[0.1, 0.2, 0.0, 0.4])
 
 
-def test_a_sliding_mass_is_newtons_law():
-    text = robot(link("base"), link("car", 3.0), joint("rail", "prismatic", "base", "car"))
-    chain = RigidChain(text, gravity=[0, 0, 0], damping=2.0)
-    x, v, u = torch.tensor([[0.4]]), torch.tensor([[1.5]]), torch.tensor([[6.0]])
-    a = chain.forward_dynamics(x.double(), v.double(), u.double())
-    assert float(a) == pytest.approx((6 - 2 * 1.5) / 3)
-
-
 def test_derivatives_by_autograd_and_a_compilable_graph():
     chain = RigidChain(TREE, locked_joints=["wrist"])
     q, v, u = (x[:3].requires_grad_() for x in states(4))
@@ -133,23 +123,6 @@ class _Dynamics(torch.nn.Module):
 def test_parameters_and_pseudo_inertia_are_each_others_inverse():
     parameters = torch.randn(5, 10, dtype=torch.float64)
     assert torch.allclose(inertial_parameters(pseudo_inertia(parameters)), parameters)
-
-
-def test_generic_bodies_come_from_the_kinematics_alone():
-    chain = RigidChain(TREE, locked_joints=["wrist"])
-    other = RigidChain(
-        TREE.replace('mass value="2.0"', 'mass value="9.0"'), locked_joints=["wrist"]
-    )
-    assert torch.equal(chain.generic_inertia(), other.generic_inertia())
-    assert torch.linalg.eigvalsh(chain.generic_inertia()).min() > 0
-
-
-def dynamics_of(chain, q, v, u):
-    """Acceleration, and the gradient of its square in the inertias of the bodies."""
-    inertia = chain.inertia.clone().requires_grad_()
-    mass, bias = chain.mass_and_bias(q, v, inertia)
-    a = torch.linalg.solve(mass, u - bias)
-    return a.detach(), torch.autograd.grad(a.square().mean(), inertia)[0]
 
 
 def test_a_payload_is_not_scaled_with_the_links():
@@ -190,34 +163,6 @@ def test_a_last_generic_body_does_not_lie_on_the_axis(axis):
             0.5 * torch.ones(1, 1).double(), *torch.zeros(2, 1, 1).double(), body
         )
         assert float(force) > 0
-
-
-@pytest.mark.slow
-@NEEDS_COMPILER
-def test_compiled_it_is_the_same_chain():
-    chain = RigidChain(TREE, locked_joints=["wrist"])
-    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(2)).double()
-    torch._dynamo.reset()
-    # One graph: anything that is done in Python between two would be an error. One C++ file.
-    options = {"cpp_wrapper": True}
-    compiled = torch.compile(chain.mass_and_bias, fullgraph=True, options=options)
-    expected = dynamics_of(chain, q, v, u)
-    chain.mass_and_bias = compiled
-    for found, value in zip(dynamics_of(chain, q, v, u), expected, strict=True):
-        assert torch.allclose(found, value, rtol=1e-9, atol=1e-11 * float(value.abs().max()))
-
-
-MIMICKING = TREE.replace(
-    '<joint name="bend" type="continuous">',
-    '<joint name="bend" type="continuous"><mimic joint="turn"/>',
-)
-
-
-def test_a_locked_mimic_joint_is_a_weld():
-    locked = ["wrist", "bend"]
-    chain, other = (RigidChain(text, locked_joints=locked) for text in (MIMICKING, TREE))
-    assert chain.joint_names == other.joint_names == ["turn", "slide", "fork"]
-    assert torch.equal(chain.inertia, other.inertia)
 
 
 def test_coordinates_may_have_another_order():

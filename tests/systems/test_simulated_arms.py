@@ -14,8 +14,7 @@ from pinn_dyn.systems import BulletArm, MujocoArm, RigidChain
 from pinn_dyn.testing.mechanical_system import Configurations, MechanicalSystemContract
 from tests.support.contracts import one_case
 from tests.support.rigid_chains import TREE
-from tests.support.simulated_arms import FINGERS, PANDA, SIMULATORS, simulated_by, states
-from tests.support.urdf_by_hand import SPATIAL, jacobian_of, urdf_frames, urdf_mass_matrix
+from tests.support.simulated_arms import FINGERS, PANDA, SIMULATORS, SPATIAL, simulated_by, states
 
 ARMS = [
     (PANDA, {"locked_joints": FINGERS, "payload": 1.5, "mass_scale": 1.2}),
@@ -49,35 +48,6 @@ class TestPanda(MechanicalSystemContract):
 # Against independent answers.
 
 
-def pendulum_terms(q, v, g=9.81):
-    """M, C v and G of the double pendulum, from its Lagrangian by hand."""
-    m1, m2, c1, c2, l1, i1, i2 = 1.5, 0.8, 0.3, 0.2, 0.5, 0.05, 0.02
-    k = m2 * l1 * c2
-    m22 = m2 * c2**2 + i2
-    m12 = m22 + k * np.cos(q[1])
-    m11 = m1 * c1**2 + i1 + m2 * l1**2 + m22 + 2 * k * np.cos(q[1])
-    coriolis = k * np.sin(q[1]) * np.array([-(2 * v[0] + v[1]) * v[1], v[0] ** 2])
-    g2 = m2 * g * c2 * np.sin(q[0] + q[1])
-    gravity = np.array([(m1 * c1 + m2 * l1) * g * np.sin(q[0]) + g2, g2])
-    return np.array([[m11, m12], [m12, m22]]), coriolis, gravity
-
-
-@pytest.mark.parametrize("gravity", [9.81, 0.0])
-def test_double_pendulum_has_the_terms_of_its_closed_form(pendulum, gravity):
-    arm = MujocoArm(pendulum(), gravity=(0, 0, -gravity), damping=(0.3, 0.2))
-    assert arm.joint_names == ["shoulder", "elbow"]
-    q, v, a = states(arm)
-    for k in range(len(q)):
-        M, Cv, G = pendulum_terms(q[k], v[k], gravity)
-        at = [torch.from_numpy(x[k]) for x in (q, v, a)]
-        np.testing.assert_allclose(arm.mass_matrix(at[0]), M, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(arm.potential_force(at[0]), G, rtol=0, atol=1e-11)
-        expected = M @ a[k] + Cv + G + np.array([0.3, 0.2]) * v[k]
-        np.testing.assert_allclose(arm.inverse_dynamics(*at), expected, rtol=0, atol=1e-11)
-        force = arm.coriolis_matrix(*at[:2]) @ at[1]
-        np.testing.assert_allclose(force, Cv, rtol=0, atol=1e-11)
-
-
 def panda_text():
     return RigidChain(PANDA).tree.path.read_text()
 
@@ -94,8 +64,10 @@ def test_the_panda_is_that_of_pybullet():
     assert arms[0].tip_position(torch.ones(7)).equal(arms[1].tip_position(torch.ones(7)))
 
 
-@pytest.mark.parametrize("urdf", [PANDA, SPATIAL, TREE])
-def test_the_terms_are_those_of_mujoco(urdf):
+@pytest.mark.parametrize(
+    ("urdf", "tip"), [(PANDA, "panda_grasptarget"), (SPATIAL, "two"), (TREE, "hand")]
+)
+def test_the_terms_are_those_of_mujoco(urdf, tip):
     """MuJoCo reads the file itself, with all joints; those that are locked stay at zero."""
     locked = [*FINGERS] if urdf == PANDA else ["wrist"] if urdf == TREE else []
     chain = RigidChain(urdf, locked_joints=locked)
@@ -113,45 +85,9 @@ def test_the_terms_are_those_of_mujoco(urdf):
         M, bias = chain.mass_and_bias(*state[:2])
         pairs = [(M, mass[np.ix_(rows, rows)]), (bias, data.qfrc_bias[rows])]
         pairs.append((chain.inverse_dynamics(*state), data.qfrc_inverse[rows]))
+        pairs.append((chain.tip_position(state[0]), data.body(tip).xpos))
         for ours, theirs in pairs:
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.abs(theirs).max())
-
-
-@pytest.mark.parametrize("urdf", [PANDA, SPATIAL])
-def test_the_mass_matrix_is_that_of_the_urdf(urdf):
-    """Skew axes, turned inertial frames and products of inertia count in full."""
-    arm = MujocoArm(urdf, locked_joints=FINGERS if urdf == PANDA else ())
-    text = panda_text() if urdf == PANDA else urdf
-    for q in states(arm)[0]:
-        M = arm.mass_matrix(torch.from_numpy(q))
-        np.testing.assert_allclose(M, urdf_mass_matrix(text, q), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("urdf", "tip", "link"),
-    [
-        (PANDA, None, "panda_grasptarget"),
-        (PANDA, "panda_link5", "panda_link5"),
-        (SPATIAL, "one", "one"),
-        (SPATIAL, None, "two"),
-    ],
-)
-def test_the_tip_is_where_the_urdf_puts_it_and_carries_the_payload(urdf, tip, link):
-    settings = {"locked_joints": FINGERS if urdf == PANDA else (), "tip": tip}
-    arm = MujocoArm(urdf, gravity=(1, -2, -9.81), **settings)
-    loaded = MujocoArm(urdf, gravity=(1, -2, -9.81), payload=2.3, **settings)
-    g = np.array(arm.gravity)
-    for q in states(arm)[0]:
-        x = torch.from_numpy(q)
-        _, r, axes = urdf_frames(panda_text() if urdf == PANDA else urdf, q)[link]
-        np.testing.assert_allclose(arm.tip_position(x), r, rtol=0, atol=1e-12)
-        J, _ = jacobian_of(r, axes, len(q))
-        slope = torch.autograd.functional.jacobian(arm.tip_position, x)
-        np.testing.assert_allclose(slope, J, rtol=0, atol=1e-12)
-        added = loaded.mass_matrix(x) - arm.mass_matrix(x)
-        np.testing.assert_allclose(added, 2.3 * J.T @ J, rtol=0, atol=1e-13)
-        added = loaded.potential_force(x) - arm.potential_force(x)
-        np.testing.assert_allclose(added, -2.3 * J.T @ g, rtol=0, atol=1e-12)
 
 
 # Motion.

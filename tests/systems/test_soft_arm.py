@@ -86,29 +86,6 @@ def test_terms_and_dynamics_are_continuous_through_the_straight_arm(segments):
         assert_near(there, here, 1e-4, scale=1e-3 + here.abs().max())
 
 
-def test_straight_arm_hangs_stretched_by_half_its_weight_over_the_stiffness():
-    """k dl = m g / 2: V = k dl^2 / 2 - m g (L0 + dl) / 2, the weight acts at half the length."""
-    arm = SoftArm(stiffness=4.0)
-    stretch = MASS * GRAVITY / (2 * 4.0)
-    rest = double([0.0, 0.0, stretch])
-    energy = arm.potential_energy(rest)
-    assert float(energy) == pytest.approx(
-        4.0 * stretch**2 / 2 - MASS * GRAVITY * (LENGTH + stretch) / 2
-    )
-    zero = torch.zeros(3, dtype=torch.float64)
-    torch.testing.assert_close(arm.forward_dynamics(rest, zero, zero), zero, rtol=0, atol=1e-12)
-    for side in (-0.01, 0.01):
-        assert arm.potential_energy(rest + double([0, 0, side])) > energy
-
-
-def test_upper_segment_also_carries_the_weight_of_the_lower_one():
-    arm = SoftArm(2, stiffness=4.0)
-    weight = MASS * GRAVITY
-    rest = double([0, 0, 1.5 * weight / 4.0, 0, 0, 0.5 * weight / 4.0])
-    zero = torch.zeros(6, dtype=torch.float64)
-    torch.testing.assert_close(arm.potential_force(rest), zero, rtol=0, atol=1e-12)
-
-
 # Independent kinematics: closed forms with their division by theta, in NumPy.
 
 
@@ -193,24 +170,6 @@ def test_input_matrix_does_the_work_of_two_bending_torques_and_an_axial_force(se
     np.testing.assert_allclose(inputs.T @ v, expected, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("lower", [1, 2])
-def test_lower_segments_straight_and_massless_leave_a_single_arm(motion, lower):
-    """What hangs below without mass and without bending adds nothing to the upper segment."""
-    q = torch.from_numpy(motion[0][:3])
-    straight = torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64).repeat(lower)
-    arm = SoftArm(1 + lower, mass=[MASS] + [0.0] * lower)
-    mass, damping, force, inputs = arm.terms(torch.cat([q, straight]))
-    expected = SoftArm(1, mass=MASS).terms(q)
-    torch.testing.assert_close(mass[:3, :3], expected.M, rtol=1e-13, atol=1e-15)
-    torch.testing.assert_close(damping[:3, :3], expected.D)
-    torch.testing.assert_close(force[:3], expected.G, rtol=1e-13, atol=1e-15)
-    torch.testing.assert_close(inputs[:3, :3], expected.A, rtol=1e-13, atol=1e-15)
-    # No inertia of their own, and only their springs pull on them.
-    assert mass[3:].abs().max() == 0 == mass[:, 3:].abs().max()
-    torch.testing.assert_close(force[3:], straight)
-    assert inputs[3:, :3].abs().max() == 0
-
-
 def test_default_quadrature_is_exact_to_twelve_digits_up_to_three_radians():
     generator = torch.Generator().manual_seed(0)
     angle = 2 * math.pi * torch.rand(6, 2, generator=generator, dtype=torch.float64)
@@ -225,11 +184,6 @@ def test_default_quadrature_is_exact_to_twelve_digits_up_to_three_radians():
         (default.inverse_dynamics(q, v, v), fine.inverse_dynamics(q, v, v)),
     ):
         assert_near(*values, 1e-12)
-
-
-def test_one_mass_or_one_for_each_segment():
-    with pytest.raises(RuntimeError, match="must match"):
-        SoftArm(2, mass=[0.3, 0.3, 0.3])
 
 
 @pytest.mark.parametrize(

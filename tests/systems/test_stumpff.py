@@ -3,7 +3,6 @@
 import math
 from fractions import Fraction
 
-import numpy as np
 import pytest
 import torch
 
@@ -25,16 +24,6 @@ def test_values_match_the_exact_series(x):
     values = stumpff(torch.tensor(x, dtype=torch.float64))
     for k, value in enumerate(values):
         assert float(value) == pytest.approx(exact(k, x), rel=1e-12, abs=4e-15), k
-
-
-def test_values_match_sine_and_cosine_up_to_a_full_circle():
-    theta = np.linspace(0.1, 2 * np.pi, 200)
-    c0, c1, c2, c3, *_ = (c.numpy() for c in stumpff(torch.from_numpy(theta**2)))
-    np.testing.assert_allclose(c0, np.cos(theta), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(c1, np.sin(theta) / theta, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(c2, (1 - np.cos(theta)) / theta**2, rtol=0, atol=1e-12)
-    # theta - sin(theta) has lost three digits at theta = 0.1.
-    np.testing.assert_allclose(c3, (theta - np.sin(theta)) / theta**3, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("x", [0.0, 1e-6, 0.5, 4.0, 30.0])

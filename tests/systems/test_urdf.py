@@ -57,7 +57,6 @@ def test_the_links_may_come_in_any_order_and_an_axis_may_have_any_length():
 
 
 WRONG = {
-    "empty": (ARM, "", "is not valid XML"),
     "a web page": (ARM, "<!DOCTYPE html><html><br></html>", "it is a web page"),
     "SDF": (
         ARM,
@@ -66,8 +65,6 @@ WRONG = {
     ),
     "xacro": ("<link", '<x:arm xmlns:x="http://wiki.ros.org/xacro"/><link', "is a xacro file"),
     "a xacro number": ('value="1.5"', 'value="${m}"', "is a xacro file"),
-    "no joint": (ARM, '<robot name="x"><link name="a"/></robot>', "there is no <joint>"),
-    "two links of a name": ('name="lower"', 'name="upper"', r"the same name: \['upper'\]"),
     "an unknown parent": (ELBOW, ELBOW.replace("upper", "uper"), r"the links \['uper'\]"),
     "a circle": (
         "</robot>",
@@ -79,8 +76,6 @@ WRONG = {
         joint("x", "base", "lower") + "</robot>",
         r"the links \['lower'\] have several parents",
     ),
-    "an axis of two": ('"0 1 0"', '"0 1"', "<axis xyz='0 1'> of shoulder, expected 3 finite"),
-    "no axis": ('"0 1 0"', '"0 0 0"', "'shoulder' has the axis 0 0 0"),
     "a type": (
         '"continuous"',
         '"continous"',
@@ -114,10 +109,7 @@ ENCODED = {
     "a byte order mark": ARM.encode("utf-8-sig"),
     "UTF-16 that states UTF-8": f'<?xml version="1.0" encoding="utf-8"?>{ARM}'.encode("utf-16"),
     "Windows-1252": ARM.replace("<link", "<!-- K\xf6rper --><link", 1).encode("cp1252"),
-    "an empty line first": f'\n<?xml version="1.0"?>\n{ARM}'.encode(),
     "a namespace": ARM.replace("<robot", '<robot xmlns="https://drake.mit.edu"', 1).encode(),
-    "a prefix": ARM.replace("</robot>", "<sensor:camera/></robot>").encode(),
-    "a wrapper": f"<model><robot/>{ARM}</model>".replace("<robot/>", "").encode(),
     "commas": ARM.replace('"0 0 -0.5"', '"0, 0, -0.5"').encode(),
 }
 
@@ -133,9 +125,7 @@ def test_a_file_is_read_as_editors_and_tools_write_it(tmp_path, content):
 
 UNUSED = {
     "no triangle": ('ixx="0.09"', 'ixx="0.2"'),
-    "a negative mass": ('value="1.5"', 'value="-1.5"'),
     "a mass in words": ('value="1.5"', 'value="1.5 kg"'),
-    "a centre of one": ('"0 0 -0.3"', '"-0.3"'),
     "no inertial": (ARM[ARM.index("<inertial>") : ARM.index("</link>")], ""),
     "a limit in words": ('lower="-1.5"', 'lower="low"'),
 }
@@ -161,7 +151,8 @@ def test_a_fit_starts_from_the_inertias_of_bodies_that_can_exist():
 
 
 IMPOSSIBLE = {
-    **{name: UNUSED[name] for name in ("no triangle", "a negative mass", "no inertial")},
+    **{name: UNUSED[name] for name in ("no triangle", "no inertial")},
+    "a negative mass": ('value="1.5"', 'value="-1.5"'),
     "kg mm^2": ('ixx="0.09" ixy="0" ixz="0" iyy="0.05"', 'ixx="9e4" ixy="0" ixz="0" iyy="9e4"'),
 }
 

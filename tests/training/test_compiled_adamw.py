@@ -46,7 +46,6 @@ def trained(model, clipping, compiled, state=None, steps=range(STEPS)):
 @pytest.mark.parametrize(
     ("clipping", "built"),
     [
-        pytest.param((None, False), False, marks=pytest.mark.slow),
         pytest.param((0.02, True), False, marks=pytest.mark.slow),
         ((0.3, False), False),
         pytest.param((0.3, False), True, marks=pytest.mark.slow),
@@ -64,15 +63,6 @@ def test_weights_gradients_and_moments_are_those_of_the_optimizer(request, clipp
     torch.testing.assert_close(gradient, slope, rtol=1e-8, atol=1e-12)
     torch.testing.assert_close(state[0]["state"], other[0]["state"], rtol=1e-8, atol=1e-12)
     assert float(state[0]["state"][0]["step"]) == STEPS
-
-
-@pytest.mark.slow
-def test_steps_go_on_from_a_saved_state_of_the_optimizer(traced):
-    model = make_model("lnn")
-    whole, _, _ = trained(copy.deepcopy(model), (0.3, False), compiled=True)
-    _, _, state = trained(model, (0.3, False), compiled=True, steps=range(3))
-    resumed, _, _ = trained(model, (0.3, False), True, state, range(3, STEPS))
-    assert torch.equal(resumed, whole)
 
 
 def test_optimizers_with_another_formula_are_not_compiled():

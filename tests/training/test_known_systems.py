@@ -10,7 +10,6 @@ from pinn_dyn.training import LeastSquares
 from tests.support.known import known_arm, known_cart_pole, motions
 
 RATE = 100.0  # Hz
-STIFFNESS = [20, 18, 30, 15, 16, 25]  # of two segments
 
 
 def runs_of(truth, seed=0):
@@ -54,14 +53,13 @@ def true_values(truth):
 
 STARTS = {
     "ten times": {"mass": 5.0, "stiffness": 200.0, "damping": 20.0},
-    "a tenth": {"mass": 0.05, "stiffness": 2.0, "damping": 0.2},
     "mixed": {"mass": 1.5, "stiffness": 4.0, "damping": 10.0},
 }
 
 
 @pytest.mark.parametrize(
     "start",
-    ["ten times", *(pytest.param(x, marks=pytest.mark.slow) for x in ("a tenth", "mixed"))],
+    ["ten times", pytest.param("mixed", marks=pytest.mark.slow)],
 )
 def test_a_soft_arm_is_found_from_starts_that_are_far_off(arm_runs, start):
     truth = known_arm()

@@ -111,22 +111,6 @@ def test_the_logged_loss_is_that_of_the_batches(tmp_path, data, cut):
     )
 
 
-def test_validation_figures_are_logged_by_name(tmp_path, data):
-    seen = []
-
-    def validator(model, truth):
-        seen.append((model, truth.q.shape))
-        return {"error_mean": 0.25, "diverged": 3.0}
-
-    model = AccelerationMLP(data.statistics, [8])
-    learner = make_learner(model, data, validator)
-    trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
-    trainer.fit(learner, LightningData(data))
-    assert float(trainer.callback_metrics["val/error_mean"]) == 0.25
-    assert float(trainer.callback_metrics["val/diverged"]) == 3.0
-    assert seen == [(model, (1, 101, 2))]
-
-
 def test_a_gradient_is_clipped_by_its_norm():
     generator = torch.Generator().manual_seed(0)
     for factor in (0.01, 1.0, 100.0):
@@ -306,11 +290,3 @@ class Follows(Callback):
         share = 1.0 if trainer.global_step == 1 else 0.1
         for mean, now in zip(self.averaged, pl_module.model.parameters(), strict=True):
             mean.lerp_(now.detach(), share)
-
-
-def test_a_precision_that_scales_the_loss_is_refused(tmp_path, data):
-    learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
-    trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
-    trainer.precision_plugin.scaler = object()
-    with pytest.raises(ValueError, match="scales the loss: use bf16-mixed"):
-        trainer.fit(learner, LightningData(data))

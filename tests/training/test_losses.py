@@ -128,7 +128,7 @@ def windows():
 
 @pytest.mark.parametrize(
     ("progress", "steps"),
-    [(0.0, 1), (0.24, 1), (0.25, 2), (0.5, 5), (0.74, 5), (0.75, 10), (1, 10)],
+    [(0.24, 1), (0.25, 2), (0.74, 5), (1, 10)],
 )
 def test_a_curriculum_rolls_out_and_compares_the_first_steps_alone(windows, progress, steps):
     model = Drift()
@@ -169,7 +169,7 @@ def test_a_penalty_is_added_at_the_first_step_of_a_window(windows):
         torch.testing.assert_close(found, expected)
 
 
-@pytest.mark.parametrize("curriculum", [[], [1, 2], [1, 20], [0, 10], [5, 2, 10], [1, 1, 10]])
+@pytest.mark.parametrize("curriculum", [[1, 2], [0, 10], [5, 2, 10]])
 def test_a_curriculum_has_to_increase_to_all_steps(windows, curriculum):
     with pytest.raises(ValueError, match=r"curriculum is .*to the 10 of the windows"):
         IncrementLoss(windows.statistics(), Drift(), curriculum=curriculum)

@@ -1,7 +1,5 @@
 """SOAP on batches of filled-up matrices moves each as the library's SOAP moves it alone."""
 
-import copy
-
 import torch
 from pytorch_optimizer import SOAP as Library
 
@@ -76,18 +74,3 @@ def test_the_zeros_that_fill_a_matrix_up_stay_zeros():
                 assert (basis[k, size:, :size] == 0).all()
                 filled += basis.shape[-1] - size
     assert filled > 100
-
-
-def test_a_training_goes_on_from_its_saved_state():
-    """The same steps in one go, and with the optimizer written and read half way."""
-    whole, halves = parameters(), parameters()
-    alone = copies(whole)
-    optimizer, first = SOAP(whole, **SETTINGS), SOAP(halves, **SETTINGS)
-    steps(whole, alone, [optimizer], 6, seed=1)
-    steps(whole, alone, [optimizer], 6, seed=2)
-    steps(halves, alone, [first], 6, seed=1)
-    second = SOAP(halves, **SETTINGS)
-    second.load_state_dict(copy.deepcopy(first.state_dict()))
-    steps(halves, alone, [second], 6, seed=2)
-    for one, other in zip(whole, halves, strict=True):
-        assert torch.equal(one, other)

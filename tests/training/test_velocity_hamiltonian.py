@@ -20,7 +20,6 @@ from pinn_dyn.models import (
 from pinn_dyn.testing import assert_near
 from tests.models.builders import make_statistics, perturb, random_batch
 
-STEP = 0.05
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[6, 5]),
     damping=partial(NetworkCholesky, hidden=[5], positivity=Positive(floor=0.0)),

@@ -51,7 +51,7 @@ def pieces_of(
     """Cut the cleaned stretches of a split into rollouts; return the rollouts and a note.
 
     Raises:
-        LogError: if the piece is no multiple of the sample time, or longer than all stretches.
+        LogError: if the piece is no multiple of the sample time.
     """
     if part.piece == "whole":
         pieces = list(stretches)
@@ -67,8 +67,6 @@ def pieces_of(
         for first in _starts(len(item), span):
             past = item.rows(slice(max(first - round(_PAST / step), 0), first))
             pieces.append(replace(item.rows(slice(first, first + span + 1)), past=past))
-    if not pieces:
-        raise LogError(f"{name}: no stretch is as long as a piece of {part.piece} s")
     unused = max(sum(item.duration for item in stretches) - len(pieces) * span * step, 0)
     return pieces, f"{summary(pieces, step)}, each one rollout; {unused:.4g} s are dropped"
 

@@ -48,9 +48,7 @@ def _motive(text: str) -> str:
     lines = text.split("\n")
     last = next((k for k, x in enumerate(lines) if x.startswith(("Frame,", '"Frame"'))), 0)
     rows = [_cells(line, ",") for line in lines[: last + 1]]
-    named = next((x for x in rows if x[1:2] == ["Name"]), None)
-    if named is None:
-        return text
+    named = next(x for x in rows if x[1:2] == ["Name"])
     quantities, axes = rows[last - 1], rows[last]
     length = next((unit for cell in rows[0] if (unit := _LENGTHS.get(cell.lower()))), "")
     names, units = axes[:2], ["", "s"]
