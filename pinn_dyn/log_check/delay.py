@@ -131,10 +131,8 @@ def input_delays(
         ones, short = np.ones(len(candidates)), "the stretches are too short"
         return [DelayCurve(candidates, ones, None, np.inf, "none", short)] * inputs
     if motors:
-        light, heavy = (
-            _best([_motion_curve(data, form, inputs, candidates) for data in trials])
-            for form in (_LIGHT, _HEAVY)
-        )
+        pairs = [_motion_curves(data, inputs, candidates) for data in trials]
+        light, heavy = map(_best, zip(*pairs, strict=True))
         curves = [_between(light, heavy)] * inputs
     else:
         bodies = []
@@ -249,20 +247,25 @@ def _input_curve(
     return _curve(candidates, shares, friction, form)
 
 
-def _motion_curve(data: Averages, form: str, inputs: int, candidates: np.ndarray) -> DelayCurve:
-    """Return the curve of all inputs of a robot that motors move."""
+def _motion_curves(
+    data: Averages, inputs: int, candidates: np.ndarray
+) -> tuple[DelayCurve, DelayCurve]:
+    """Return the curves of all inputs of a robot that motors move, without and with an inertia."""
     motion = (data.v - data.v.mean(axis=0)) / data.v.std(axis=0).clip(min=1e-300)
     inertia = np.hstack([data.a, *(data.a * q[:, None] for q in data.q.T)])
-    rows, shares = len(data.independent(1.0)), []
+    rows, light, heavy = len(data.independent(1.0)), [], []
     for delay in candidates:
         u = [data.input_at(i, data.t - delay) for i in range(inputs)]
-        columns = {"f": _polynomial(np.column_stack([data.q, *u]), rows), "motion": motion}
-        columns |= {"inertia": inertia} if form == _HEAVY else {}
+        f = _polynomial(np.column_stack([data.q, *u]), rows)
+        columns = {"f": f, "inertia": inertia, "motion": motion}
         regression = EquationOfMotionRegression(columns, tenths(data))
-        names = [name for name in columns if name != "motion"]
-        shares.append(regression.fit("motion", names).shares.mean(axis=1))
-    residual = np.stack(shares, axis=1)
-    return _curve(candidates, residual, np.full_like(residual, np.nan), form)
+        light.append(regression.fit("motion", ["f"]).shares.mean(axis=1))
+        heavy.append(regression.fit("motion", ["f", "inertia"]).shares.mean(axis=1))
+    friction = np.full_like(np.transpose(light), np.nan)
+    return (
+        _curve(candidates, np.transpose(light), friction, _LIGHT),
+        _curve(candidates, np.transpose(heavy), friction, _HEAVY),
+    )
 
 
 def _polynomial(x: np.ndarray, rows: int) -> np.ndarray:
