@@ -13,7 +13,6 @@ from torch import Tensor
 from pinn_dyn.control.effects import Actuator, Values
 from pinn_dyn.mechanics.arrays import listed
 
-_KINDS = "is_python", "is_long", "predicts"
 _ROUNDING = 1e-6  # relative; numbers of files may be of type float
 
 
@@ -144,17 +143,15 @@ class Wrapper(Stage):
     def __init__(self, law: Stage, own_size: int = 0):
         super().__init__(law.num_coordinates, law.num_inputs)
         self.law, self.own_size = law, own_size
-        self._adopt(law)
-
-    def _adopt(self, law: Stage) -> None:
-        self.law, self.memory_size = law, self.own_size + law.memory_size
-        for name in ("ahead", "model", "first_input", *_KINDS):
+        self.memory_size = own_size + law.memory_size
+        self.needs_period = law.needs_period or own_size > 0
+        for name in ("ahead", "model", "first_input", "is_python", "is_long", "predicts"):
             setattr(self, name, getattr(law, name))
-        self.needs_period = law.needs_period or self.own_size > 0
 
     def at(self, setting: Setting) -> Any:
         stage = super().at(setting)
-        stage._adopt(self.law.at(setting))
+        stage.law = self.law.at(setting)
+        stage.memory_size = self.own_size + stage.law.memory_size
         return stage
 
     def stiffness(self) -> tuple[Tensor, Tensor] | None:
