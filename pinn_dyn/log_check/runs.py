@@ -353,7 +353,7 @@ def check_runs(
         results.append(measurement)
         parts.append(Interval(int(k), float(times[0]), float(times[-1])))
     largest = float((residual / usual).max())
-    good = judged(RESIDUAL, "all runs", largest, f"below {_RATIO:g}", False, "")
+    good = judged(RESIDUAL, "all runs", largest, f"below {_RATIO:g}, or no clear cause", False, "")
     return results or [good], parts
 
 
