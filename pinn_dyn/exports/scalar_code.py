@@ -105,6 +105,20 @@ class ScalarTerms:
             return a
         return self.term("where", mask, a, b) if value is None else b
 
+    # Masks that are constant are numbers, which C cannot combine with flags.
+
+    def _logical_and(self, a: Term, b: Term) -> Term:
+        for x, y in ((a, b), (b, a)):
+            if self.value(x) is not None:
+                return y if self.value(x) else x
+        return self.term("logical_and", a, b)
+
+    def _logical_or(self, a: Term, b: Term) -> Term:
+        for x, y in ((a, b), (b, a)):
+            if self.value(x) is not None:
+                return x if self.value(x) else y
+        return self.term("logical_or", a, b)
+
     def _clone(self, a: Term) -> Term:
         return a
 

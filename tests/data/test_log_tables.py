@@ -219,3 +219,9 @@ def test_rows_of_single_joints_become_columns(tmp_path, clock):
     log = source(tmp_path, long="joint", **LONG, **({} if clock else {"time": {"rate": 100}}))
     assert_equal(log)
     assert not log.warnings
+
+
+def test_a_packed_file_is_to_be_unpacked(tmp_path):
+    (tmp_path / "run.zip").write_bytes(b"PK")
+    with pytest.raises(LogError, match=r"no reader for '.zip': unpack it, and name the files"):
+        source(tmp_path, files="run.zip").load()

@@ -51,6 +51,7 @@ READERS: dict[str, Reader] = {
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
 """Reader of each suffix. The folder of a ROS 2 bag is read as ``.db3``."""
+_PACKED = (".zip", ".tar", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst")
 
 
 def _is_bag(path: Path) -> bool:
@@ -68,9 +69,10 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
     """
     suffix = ".db3" if _is_bag(path) else path.suffix.lower().replace(".active", ".bag")
     if suffix not in READERS:
-        raise LogError(
-            f"{path}: no reader for {suffix!r}: save the log as one of {', '.join(READERS)}"
-        )
+        cure = f"save the log as one of {', '.join(READERS)}"
+        if suffix in _PACKED:
+            cure = "unpack it, and name the files in it"
+        raise LogError(f"{path}: no reader for {suffix!r}: {cure}")
     try:
         content = READERS[suffix](path, request)
     except Exception as error:  # a damaged file raises nearly anything
