@@ -45,16 +45,16 @@ def test_the_remaining_time_excludes_what_came_before_the_first_step(monkeypatch
 def test_a_training_and_its_evaluation_log_their_progress(quick, tmp_path, capsys, caplog):
     run = train(
         tmp_path / "run",
-        *("model=lnn", "trainer.steps=40", "trainer.enable_progress_bar=true", NO_FIGURES),
+        *("model=lnn", "trainer.steps=100", "trainer.enable_progress_bar=true", NO_FIGURES),
     )
     text = (run / "train.log").read_text()
     shown = capsys.readouterr().out
-    for part in ("training soft_arm_1/lnn seed 0: ", " of 40 steps, loss ", " s left"):
+    for part in ("training soft_arm_1/lnn seed 0: ", " of 100 steps, loss ", " s left"):
         assert part in text
         assert part in shown
     losses = EventAccumulator(str(run / "tensorboard")).Reload().Scalars("train/loss")
-    assert [item.step for item in losses] == list(range(1, 40, 2))
-    assert len({item.value for item in losses}) == 20
+    assert [item.step for item in losses] == list(range(1, 100, 2))
+    assert len({item.value for item in losses}) == 50
     caplog.set_level(logging.INFO)
     pinn_dyn.evaluate(pinn_dyn.load(run), horizon=0.1, windows=[])
     assert "evaluation: 0 of 5 models, now " in caplog.text
