@@ -81,7 +81,7 @@ _RESIDUALS, _DELAYS = "residuals", "delays"  # names of places in the page
 _OF_STATES = (
     "The residual of each force over position and speed of its joint, in all runs: of rigid bodies "
     "with a URDF, else of a generic equation, which has a spring at each joint. A curve over q "
-    "is a spring that the equation lacks, a hose, a stop or a wrong kinematics. The residual over v "
+    "is a spring that it lacks, a hose, a stop or a wrong kinematics. The residual over v "
     "includes the dry friction, whose curve is visible there."
 )
 _INPUTS = (

@@ -75,12 +75,12 @@ def test_a_regulator_that_diverges_ends_with_an_error(own_log):
 
 @pytest.mark.slow
 def test_the_example_log_determines_a_model_that_controls(home):
-    """The regulator holds its set point after 300 of the 1,000 steps of the example."""
+    """The regulator holds its set point after 400 of the 1,000 steps of the example."""
     folder = home / "whole_log"  # own_log.py reads the log beside it
     folder.mkdir()
     for name in ("own_log.py", "example_log.csv"):
         shutil.copy(EXAMPLES / name, folder)
-    run(str(folder / "own_log.py"), "--folder", "runs/whole", "--steps", "300")
+    run(str(folder / "own_log.py"), "--folder", "runs/whole", "--steps", "400")
     text = run("regulator_in_a_loop.py", "runs/whole", "--duration=2", "--gains", "5", "0.4")
     errors = re.search(r"final error: \[(.*)\]", text)[1].split()
     assert max(map(float, errors)) < 0.01  # of steps of 0.4 and 0.3 rad
