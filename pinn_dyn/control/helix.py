@@ -13,7 +13,6 @@ from pydantic import PositiveFloat
 
 from pinn_dyn.control.contracts import Motion, Reference
 from pinn_dyn.control.references import smooth_step
-from pinn_dyn.mechanics.arrays import jacobians
 from pinn_dyn.systems import HasTip
 
 _KNOTS_PER_TURN = 64
@@ -127,9 +126,9 @@ class Helix(Reference):
         """Return the configuration nearest to ``home`` that puts the tip at p(phi)."""
         target, q = self._point(phi), guess
         for _ in range(_ITERATIONS):
-            tip, (jacobian,) = jacobians(arm.tip_position, torch.from_numpy(q))
-            error = target - tip.numpy()
-            left, values, rows = np.linalg.svd(jacobian.numpy(), full_matrices=False)
+            tip, jacobian = _tip_and_jacobian(arm, q)
+            error = target - tip
+            left, values, rows = np.linalg.svd(jacobian, full_matrices=False)
             homing = home - q  # only the part in the null space is used
             change = homing + rows.T @ (
                 values / (values**2 + _DAMPING**2) * (left.T @ error) - rows @ homing
@@ -146,3 +145,11 @@ class Helix(Reference):
 
 def _tip(arm: HasTip, q: np.ndarray) -> np.ndarray:
     return arm.tip_position(torch.from_numpy(q)).numpy()
+
+
+def _tip_and_jacobian(arm: HasTip, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    with torch.enable_grad():
+        x = torch.from_numpy(q).requires_grad_()
+        tip = arm.tip_position(x)
+        rows = [torch.autograd.grad(entry, x, retain_graph=True)[0] for entry in tip]
+    return tip.detach().numpy(), torch.stack(rows).numpy()

@@ -32,8 +32,8 @@ class Joint:
     turns: bool = True
 
     def unit(self, quantity: str) -> str:
-        """Return the unit of a quantity, such as ``"force"`` or ``"inertia"``."""
-        return _UNITS[quantity][self.turns]
+        """Return the unit of a quantity, such as ``"force"``; a unit is returned as it is."""
+        return _UNITS.get(quantity, (quantity, quantity))[self.turns]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Scales:
             ratio: initial value in units of the scale.
             scale: typical size, ``(N,)``.
             spread: prior standard deviation of the logarithm.
-            quantity: quantity whose unit the constants have, see :meth:`Joint.unit`.
+            quantity: quantity whose unit the constants have, or the unit, see :meth:`Joint.unit`.
             floor: lower limit in units of the scale, or of the mean scale if ``prior`` is true.
         """
         names = [f"{label} of {joint.name}" for joint in self.joints]

@@ -61,8 +61,7 @@ def default_split(
     the test, and the 15 % before are the validation. Both are cut into pieces of at most 5 s, short
     enough for stretches from which the cleaning drops ``lost`` s.
     """
-    spacing = np.concatenate([np.diff(t) for t in runs.values()])
-    step = float(np.median(spacing[spacing > 0]))
+    step = _usual_step([*runs.values()])
     lengths = {name: float(np.ptp(t)) for name, t in runs.items()}
     whole_runs = len(runs) >= _WHOLE_RUNS
     median, shortest = float(np.median([*lengths.values()])), min(lengths.values())
@@ -86,7 +85,7 @@ def fitting(part: Part, stretches: Sequence[Recording], lead: float, report: Rep
     if part.piece == "whole":
         return part
     durations = [item.duration for item in stretches]
-    step = float(np.median(np.diff(stretches[0].t)))
+    step = _usual_step([item.t for item in stretches])
     usual = min(float(np.median(durations)) - lead, _PIECE)
     if part.piece is None:
         return replace(part, piece=_whole_steps(usual, step))
@@ -97,6 +96,12 @@ def fitting(part: Part, stretches: Sequence[Recording], lead: float, report: Rep
     text = f"pieces of {piece:g} s instead of {part.piece:g} s, as the input delay drops {lead:g} s"
     report.add("Splits", stretches[durations.index(longest)].place, text)
     return replace(part, piece=piece)
+
+
+def _usual_step(times: Sequence[np.ndarray]) -> float:
+    """Return the median time between samples that are not at the same time, s."""
+    spacing = np.concatenate([np.diff(t) for t in times])
+    return float(np.median(spacing[spacing > 0]))
 
 
 def _whole_steps(duration: float, step: float) -> float:
