@@ -100,10 +100,9 @@ def delay_curves(curves: Sequence[DelayCurve], names: Sequence[str]) -> Figure:
 
 
 def _means(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centers and means of y in equal parts of the range of x."""
+    """Return centers and means of y in equal parts of the range of x; NaN for few points."""
     edges = np.linspace(x.min(initial=0.0), x.max(initial=1e-9), _BINS + 1)
     part = np.clip(np.digitize(x, edges) - 1, 0, _BINS - 1)
     counts = np.bincount(part, minlength=_BINS)
-    enough = counts >= _FEWEST
-    means = np.bincount(part, y, minlength=_BINS)[enough] / counts[enough]
-    return ((edges[1:] + edges[:-1]) / 2)[enough], means
+    means = np.bincount(part, y, minlength=_BINS) / np.where(counts >= _FEWEST, counts, np.nan)
+    return (edges[1:] + edges[:-1]) / 2, means
