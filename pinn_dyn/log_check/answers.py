@@ -43,7 +43,7 @@ SECTION = "docs/bags_and_other_logs.md#is-the-log-good-enough"
 """Section of the documentation about the check of a log."""
 OF_MOTORS = {"rad", "m", "Pa"}
 """Units of motor angles, lengths of tendons, and pressures."""
-_EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
+_EXPLAINED = 0.1  # share of the motion that inputs explain, below which a log is not suitable
 _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _FITS = 0.1  # usual residual of a window, below which no other equation is tried
 _WRONG = "the robot of the URDF has other forces"  # reason why there is no delay

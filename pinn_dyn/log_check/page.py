@@ -80,9 +80,9 @@ _FORCES = (
 _RESIDUALS, _DELAYS = "residuals", "delays"  # names of places in the page
 _OF_STATES = (
     "The residual of each force over position and speed of its joint, in all runs: of rigid bodies "
-    "with a URDF, else of a generic equation, which has a spring at each joint. A curve over q "
-    "is a spring that it lacks, a hose, a stop or a wrong kinematics. The residual over v "
-    "includes the dry friction, whose curve is visible there."
+    "with a URDF, else of a generic equation, which has a linear spring at each joint. A curve "
+    "over q shows a hose, a stop or wrong kinematics, and with a URDF also a spring. The residual "
+    "over v includes the dry friction, whose curve is visible there."
 )
 _INPUTS = (
     "The curve shows the share of the equation of motion that stays unexplained if an input is "

@@ -29,7 +29,7 @@ LAWS = config_folder("control") / "experiment"
     [path.relative_to(LAWS).with_suffix("").as_posix() for path in sorted(LAWS.rglob("*.yaml"))],
 )
 def test_every_experiment_of_a_law_is_accepted(experiment):
-    """Those of models are trained by tests/app/test_configurations.py."""
+    """Options of models are trained by tests/app/test_configurations.py."""
     config = checked("control", compose("control", f"experiment={experiment}"))
     assert "learned" in config["controllers"]
 

@@ -214,7 +214,7 @@ def check_lost_rows(recordings: Sequence[Recording], q: Columns) -> list[Measure
         name=LOST,
         place=", ".join(q.columns),
         value=share,
-        expected="0, or not in whole sample times",
+        expected="0, or no whole sample times",
         bad=bool(bad),
         text=f"in {100 * share:.2g} % of the steps q moves as far as v does in two or more sample "
         "times: rows are lost, and the clock counts the rows that are left; log the times of the "
